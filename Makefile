@@ -4,6 +4,7 @@
 # make lint      install, check style, types and spelling
 # make docs      install, build the documentation into build/docs, with warnings as errors
 # make chaos     install, kill whatever a sweep is made of for ten minutes: SECONDS=600 SEED=0
+# make s3-test   install, run the tests of an object store against a server that speaks S3's protocol
 # make storage-test   install, run a sweep on a cluster that shares an S3 server and no folder, and harm it: needs root, says so
 # make cluster-test   install, run docker/compose.yaml's cluster in network namespaces and harm it: needs root, says so
 #
@@ -13,7 +14,7 @@ PYTHON ?= python3
 TORCH_INDEX ?=
 BIN := .venv/bin
 
-.PHONY: install demo test lint docs chaos cluster-test storage-test clean
+.PHONY: install demo test lint docs chaos cluster-test s3-test storage-test clean
 .DEFAULT_GOAL := install
 
 install: .venv/installed
@@ -49,10 +50,13 @@ cluster-test: install
 	$(BIN)/python -m tests.faults.cluster --log results/cluster/log.txt
 
 # moto wants a newer graphql-core than MLflow: it stays beside the environment
-storage-test: install
+s3-test: install
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt s3fs
 	$(BIN)/pip install --quiet --disable-pip-version-check --target .venv/moto 'moto[server]'
+	PYTHONPATH=.venv/moto $(BIN)/python -c 'import s3fs, moto.server'  # without them the tests are skipped
 	PYTHONPATH=.venv/moto $(BIN)/python -m pytest -q tests/orchestrator/test_s3.py
+
+storage-test: s3-test
 	PYTHONPATH=.venv/moto $(BIN)/python -m tests.faults.cluster_storage --log results/cluster/storage.txt
 
 clean:

@@ -114,6 +114,16 @@ def modules_here() -> AbstractContextManager[None]:
         return nullcontext()
 
 
+def modules_folder() -> str | None:
+    """Return the folder of ``modules_in``, else the working directory; None if that has been deleted."""
+    if MODULES in os.environ:
+        return os.environ[MODULES]
+    try:
+        return str(Path.cwd())
+    except FileNotFoundError:
+        return None
+
+
 def import_module(name: str) -> ModuleType:
     """Import a module by its dotted name, also from the folder of ``modules_in``.
 

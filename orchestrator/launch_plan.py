@@ -17,8 +17,8 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.only_selection import select
-from recrl.orchestrator.provenance.code_changes import InstalledCode, has_other_code
-from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.provenance.code_changes import CodeComparison, InstalledCode, compare_files
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
 
 # Proportional set size of a trial's process with torch, and of Ray's daemons with the driver and the MLflow
 # sync; rounded up from readings with Ray 2.60 and torch 2.13. A task's own buffers are additional.
@@ -81,13 +81,13 @@ class PlannedTrial:
         spec: the trial.
         action: the planned action.
         record: from its files.
-        has_other_code: whether an attempt ran other code than is installed now.
+        code: what its attempts ran, compared with what is installed now.
     """
 
     spec: TrialSpec
     action: PlannedAction
     record: TrialRecord
-    has_other_code: bool = False
+    code: CodeComparison = field(default_factory=CodeComparison)
 
     @property
     def steps_left(self) -> int:
@@ -120,7 +120,12 @@ class Plan:
     @property
     def other_code(self) -> tuple[PlannedTrial, ...]:
         """Return the trials that ran other code than is installed now and are not run again."""
-        return tuple(it for it in self.trials if it.has_other_code and it.action is not PlannedAction.RERUN)
+        return tuple(it for it in self.trials if it.code.differs and it.action is not PlannedAction.RERUN)
+
+    @property
+    def missing_modules(self) -> tuple[frozenset[str], ...]:
+        """Return the missing modules of each trial that is not run again."""
+        return tuple(it.code.missing for it in self.trials if it.action is not PlannedAction.RERUN)
 
     @property
     def counts(self) -> Mapping[PlannedAction, int]:
@@ -170,10 +175,10 @@ def make_plan(specs: Sequence[TrialSpec], store: SweepStore, selection: TrialSel
         trial = store.trial(spec)
         record = trial.verified_record() if selection.rerun_damaged else trial.record()
         action = _planned_action(record, selection)
-        changed = has_other_code(trial, spec, installed)
-        if (changed and selection.rerun_changed) or trial.rerun_has_begun:
+        code = compare_files(trial, spec, installed)
+        if (code.differs and selection.rerun_changed) or trial.rerun_has_begun:
             action = PlannedAction.RERUN
-        trials.append(PlannedTrial(spec, action, record, changed))
+        trials.append(PlannedTrial(spec, action, record, code))
     orphans = tuple(trial for trial in store.trials() if trial.folder.name not in wanted)
     return Plan(tuple(trials), orphans)
 
@@ -256,15 +261,15 @@ def usable_cores(quota_file: Path = Path("/sys/fs/cgroup/cpu.max")) -> int:
 
 def _planned_action(record: TrialRecord, selection: TrialSelection) -> PlannedAction:
     match record.status:
-        case TrialState.COMPLETE:
+        case TrialStatus.COMPLETE:
             return PlannedAction.COMPLETE
-        case TrialState.FAILED:
+        case TrialStatus.FAILED:
             return PlannedAction.RETRY if selection.retry_failed else PlannedAction.FAILED
-        case TrialState.DAMAGED:
-            was_ended = record.claims in (TrialState.COMPLETE, TrialState.FAILED)
+        case TrialStatus.DAMAGED:
+            was_ended = record.claims in (TrialStatus.COMPLETE, TrialStatus.FAILED)
             left_alone = was_ended and not selection.rerun_damaged
             return PlannedAction.DAMAGED if left_alone else PlannedAction.REPAIR
-        case TrialState.WAITING | TrialState.RUNNING:
+        case TrialStatus.WAITING | TrialStatus.RUNNING:
             return PlannedAction.RESUME if record.attempt else PlannedAction.NEW
 
 

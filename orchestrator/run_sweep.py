@@ -27,7 +27,7 @@ from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.only_selection import select
 from recrl.orchestrator.launch_plan import Plan, PlannedAction, TrialSelection, make_plan
 from recrl.orchestrator.provenance.versions import collect
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, TrialProgress, progress
 
@@ -215,7 +215,7 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
         say: called on the first signal, in that thread.
     """
     first: queue.SimpleQueue[bool] = queue.SimpleQueue()
-    came: list[float] = []
+    times: list[float] = []
 
     def answer() -> None:
         if first.get():
@@ -224,12 +224,12 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
 
     def handle(number: int, frame: FrameType | None) -> None:
         now = time.monotonic()
-        if came and now - came[-1] <= ONE_SIGNAL_SECONDS:
+        if times and now - times[-1] <= ONE_SIGNAL_SECONDS:
             return
-        came.append(now)
-        if len(came) == 1:
+        times.append(now)
+        if len(times) == 1:
             first.put(True)
-        elif len(came) == 2:
+        elif len(times) == 2:
             raise KeyboardInterrupt
         else:
             signal.signal(number, signal.SIG_DFL)
@@ -244,8 +244,8 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
     try:
         yield
     finally:
-        if len(came) > 1:  # its duplicates must not reach the handlers of before
-            time.sleep(max(0.0, came[-1] + ONE_SIGNAL_SECONDS - time.monotonic()))
+        if len(times) > 1:  # its duplicates must not reach the handlers of before
+            time.sleep(max(0.0, times[-1] + ONE_SIGNAL_SECONDS - time.monotonic()))
         for number, handler in before.items():
             signal.signal(number, handler)
         first.put(False)
@@ -261,8 +261,8 @@ def _write_files(grid: GridSpec, specs: Sequence[TrialSpec], store: SweepStore) 
             created = info["created"]
     except DamagedError as error:
         logger.warning("%s; MLflow shows it as a new sweep", error)
-    told = {"name": grid.name, "created": created, "launched": time.time()}
-    store.write_info({**told, "silence_seconds": grid.resources.silence_seconds, **collect()})
+    launch = {"name": grid.name, "created": created, "launched": time.time()}
+    store.write_info({**launch, "silence_seconds": grid.resources.silence_seconds, **collect()})
     store.write_specs(specs, grid.text)
 
 
@@ -270,8 +270,8 @@ def _leave_none_running(specs: Sequence[TrialSpec], store: SweepStore) -> None:
     """Set trials with the status running to waiting: no process runs them."""
     for spec in specs:
         files = store.trial(spec)
-        if files.record().status is TrialState.RUNNING:
+        if files.record().status is TrialStatus.RUNNING:
             try:
-                files.set_status(TrialState.WAITING)
+                files.set_status(TrialStatus.WAITING)
             except StorageError as error:  # the next launch reports it; an earlier error is not hidden
                 logger.warning("%s", error)

@@ -25,7 +25,7 @@ from recrl.orchestrator.untrusted import ChoiceFile, LimitValues, check_json, fi
 from recrl.teachers.teacher import TeacherSpec
 
 
-class TrialState(StrEnum):
+class TrialStatus(StrEnum):
     """Status of a trial in its files."""
 
     WAITING = "waiting"
@@ -37,7 +37,7 @@ class TrialState(StrEnum):
     @property
     def is_finished(self) -> bool:
         """Whether another launch of the same grid would leave the trial alone."""
-        return self in (TrialState.COMPLETE, TrialState.FAILED)
+        return self in (TrialStatus.COMPLETE, TrialStatus.FAILED)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.process_scope import has_ended
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 
 
 class DisplayStatus(StrEnum):
@@ -133,15 +133,15 @@ def display_status(record: TrialRecord, *, now: float, silence_seconds: float) -
         silence_seconds: after which a running trial counts as dead; see ``SweepStore.silence_seconds``.
     """
     match record.status:
-        case TrialState.COMPLETE:
+        case TrialStatus.COMPLETE:
             return DisplayStatus.COMPLETE
-        case TrialState.FAILED:
+        case TrialStatus.FAILED:
             return DisplayStatus.FAILED
-        case TrialState.DAMAGED:
+        case TrialStatus.DAMAGED:
             return DisplayStatus.DAMAGED
-        case TrialState.WAITING:
+        case TrialStatus.WAITING:
             return DisplayStatus.STOPPED if record.attempt else DisplayStatus.WAITING
-        case TrialState.RUNNING:
+        case TrialStatus.RUNNING:
             silent = abs(now - record.heartbeat) > silence_seconds  # also if another clock is ahead
             is_dead = silent or has_ended(record.pid, record.pid_scope)
             return DisplayStatus.INTERRUPTED if is_dead else DisplayStatus.RUNNING

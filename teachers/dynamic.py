@@ -8,12 +8,16 @@ literal pseudocode wherever it is defined.
 
 - *Clock.* The agent learns once per policy update, so the curriculum decides once per update, over windows of
   whole updates (``windows``). With one episode per update this is Algorithm 2's clock.
-- *Enough episodes* (``window_grows``). The ratio of two noisy means passes the test of line 5 by chance. With
-  8 episodes per window, constant policies of Safety Gym did in up to 59% of the cases. So a window includes
-  more updates until the standard errors of its means are within the tolerances. Until then there is no
-  decision. The tolerances are relative to the mean or to the episodes' standard deviation, whichever is
-  larger, so that 100 episodes are always enough. A window has at least ``LEAST_EPISODES``: two or three
-  episodes agree by chance, and one has no standard error.
+- *Enough episodes* (``window_grows``). With few episodes chance decides the test of line 5, whether the
+  policy changes or not. With 8 episodes per window, constant policies of Safety Gym, which have converged,
+  passed it in at most 59% of the cases. So a window includes more updates until the standard errors of its
+  means are within the tolerances. Until then there is no decision. The tolerances are relative to the mean or
+  to the episodes' standard deviation, whichever is larger, so that 100 episodes are always enough. A window
+  has at least ``LEAST_EPISODES``: two or three episodes agree by chance, and one has no standard error.
+- *A constant policy need not pass at once.* If both means have the standard error s, their difference has
+  sqrt(2) s. So a quantity of a constant policy passes with probability erf(tolerance / (2 s)). That is 52% at
+  s = tolerance, the least precision of a decision, and 84% at half of it. Return and cost must both pass,
+  which is less likely. The test is repeated after each update, over windows that move on.
 - *Zero and negative means* (line 5). For an agent without costs, |new / old - 1| divides by zero, and the
   agent would wait without end. Here the test is |new - old| <= eps max(|old|, floor). It is the same if old
   is large, and 0 after 0 has converged. The floor avoids comparing small means by their noise. With

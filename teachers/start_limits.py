@@ -11,8 +11,9 @@ training budget the agent learns without limits in the infinite dimensions. Then
 
     d_t := max(d_d, the largest mean cost of any window of episodes so far),
 
-where windows are consecutive and of at least 32 episodes. If no episode has finished by then, the measurement
-continues until one has.
+where windows are consecutive and of at least 32 finished episodes. First episodes that are cut, to spread the
+environments over an episode's steps, do not count. If no window is complete by then, the episodes so far are
+one, possibly fewer than 32. If no episode has finished by then, the measurement continues until one has.
 
 Notation: k the number of costs, B the training budget in environment steps, f = ``start_fraction``.
 """

@@ -20,7 +20,7 @@ from recrl.analysis.data.sweep_data import Sweep, load
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_writer import TrialWriter
-from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import sync
 
@@ -100,7 +100,7 @@ class MadeUpSweep:
         if stopped:
             writer.commit({}, update=updates, env_steps=updates * STEPS_PER_UPDATE)
             if spec.title in self.failed:
-                writer.close(TrialState.FAILED, error="ValueError: the river froze", traceback="...")
+                writer.close(TrialStatus.FAILED, error="ValueError: the river froze", traceback="...")
             return
         writer.write_evaluation(
             [
@@ -111,7 +111,7 @@ class MadeUpSweep:
             ]
         )
         writer.commit({}, update=updates, env_steps=updates * STEPS_PER_UPDATE)
-        writer.close(TrialState.COMPLETE)
+        writer.close(TrialStatus.COMPLETE)
 
 
 def _write_updates(

@@ -33,7 +33,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from recrl.agents.algorithms.cpo import LocalModel, improvement, linearise, to_parameter_step
 from recrl.agents.algorithms.own_options import CRPOConfig
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
@@ -48,6 +47,7 @@ from recrl.agents.trust_region.cpo_dual import (
     projection_weights,
 )
 from recrl.agents.trust_region.line_search import line_search
+from recrl.agents.trust_region.local_model import LocalModel, improvement, linearise, to_parameter_step
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 

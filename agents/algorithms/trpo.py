@@ -13,7 +13,6 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from recrl.agents.algorithms.cpo import LocalModel, improvement
 from recrl.agents.algorithms.own_options import TRPOConfig
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Experience
@@ -24,6 +23,7 @@ from recrl.agents.learning.policy_rule import Stateful, indexed
 from recrl.agents.shared_options import TrustRegionConfig
 from recrl.agents.trust_region.conjugate_gradient import conjugate_gradient
 from recrl.agents.trust_region.line_search import line_search
+from recrl.agents.trust_region.local_model import LocalModel, improvement
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 

@@ -35,7 +35,7 @@ from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, Stateful, improve_and_measure, indexed, united
 from recrl.agents.learning.scales import RunningScale, quotient
-from recrl.agents.networks.architecture import INITIALISERS, NetworkForm
+from recrl.agents.networks.architecture import INITIALISERS, NetworkArchitecture
 from recrl.agents.networks.flat_parameters import Adam
 from recrl.agents.observation_features import Encoder
 from recrl.agents.shared_options import ActorCriticConfig
@@ -297,7 +297,7 @@ def fresh_agent(
         scales=config.proximity_scales if config.encoder == "proximity" else (),
         normalise=_normalised_numbers(cmdp, config),
     )
-    form = NetworkForm(
+    architecture = NetworkArchitecture(
         config.hidden_sizes,
         INITIALISERS[config.initialisation],
         config.activation,
@@ -308,13 +308,18 @@ def fresh_agent(
         """Make the policy before the first update; return the generator for further networks, too."""
         generator = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> 1))
         made = StochasticPolicy(
-            encoder.size, cmdp.action_space, form, config.last_layer_scale, generator, min_std=config.min_std
+            encoder.size,
+            cmdp.action_space,
+            architecture,
+            config.last_layer_scale,
+            generator,
+            min_std=config.min_std,
         )
         return made, generator
 
     policy, generator = first_policy()
     averaged, _ = first_policy()
-    critics = Critics(encoder.size, cmdp.num_costs, form, generator)
+    critics = Critics(encoder.size, cmdp.num_costs, architecture, generator)
     order = np.random.SeedSequence(entropy=seed.entropy, spawn_key=(*seed.spawn_key, 0))
     return ActorCritic(
         cmdp,

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.networks.architecture import NetworkForm
+from recrl.agents.networks.architecture import NetworkArchitecture
 from recrl.agents.networks.network_stack import make_stack
 from recrl.agents.networks.tanh_stack import blocks
 
@@ -21,15 +21,25 @@ class Critics:
     Args:
         num_observations: n.
         num_costs: k.
-        form: of each network.
+        architecture: of each network.
         generator: the initialisation's randomness.
     """
 
     def __init__(
-        self, num_observations: int, num_costs: int, form: NetworkForm, generator: torch.Generator
+        self,
+        num_observations: int,
+        num_costs: int,
+        architecture: NetworkArchitecture,
+        generator: torch.Generator,
     ) -> None:
         self.parameters, self._stack = make_stack(
-            form, 1 + num_costs, num_observations, 1, last_scale=1.0, generator=generator, role="critic"
+            architecture,
+            1 + num_costs,
+            num_observations,
+            1,
+            last_scale=1.0,
+            generator=generator,
+            role="critic",
         )
 
     def values(self, rows: Tensor) -> npt.NDArray[np.float64]:

@@ -24,7 +24,7 @@ from torch import Tensor
 from recrl.agents.learning.distributions import Categorical, Distribution, Gaussian
 from recrl.agents.learning.learning_batch import find_repeated
 from recrl.agents.learning.noise_scales import matching_log_std, matching_scale, off_greedy_mass
-from recrl.agents.networks.architecture import NetworkForm
+from recrl.agents.networks.architecture import NetworkArchitecture
 from recrl.agents.networks.network_stack import make_stack
 from recrl.agents.networks.tanh_stack import Scratch, TanhStack, blocks
 from recrl.agents.spaces import action_size
@@ -49,7 +49,7 @@ class StochasticPolicy:
     Args:
         num_observations: n.
         action_space: of one environment.
-        form: of the network.
+        architecture: of the network.
         last_scale: factor on the last layer's initial weights; small means nearly uniform or zero-mean.
         generator: the initialisation's randomness.
         min_std: lower bound of a Gaussian's standard deviations, in half ranges; of m > 2 actions it is
@@ -66,7 +66,7 @@ class StochasticPolicy:
         self,
         num_observations: int,
         action_space: gymnasium.Space[Any],
-        form: NetworkForm,
+        architecture: NetworkArchitecture,
         last_scale: float,
         generator: torch.Generator,
         *,
@@ -76,7 +76,7 @@ class StochasticPolicy:
         self.action_space = action_space
         self.is_categorical = isinstance(action_space, Discrete)
         self.parameters, self.stack = make_stack(
-            form,
+            architecture,
             1,
             num_observations,
             num_outputs,

@@ -27,7 +27,7 @@ INITIALISERS: dict[str, Initialiser] = {"orthogonal": orthogonal, "xavier": xavi
 
 
 @dataclass(frozen=True)
-class NetworkForm:
+class NetworkArchitecture:
     """Architecture of an agent's networks.
 
     Attributes:

@@ -8,7 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
-from recrl.agents.networks.architecture import NetworkForm
+from recrl.agents.networks.architecture import NetworkArchitecture
 from recrl.agents.networks.flat_parameters import FlatParameters
 from recrl.agents.networks.module_stack import ModuleStack, checked_module, perceptron
 from recrl.agents.networks.tanh_stack import Scratch, TanhStack
@@ -54,7 +54,7 @@ class Stack(Protocol):
 
 
 def make_stack(
-    form: NetworkForm,
+    architecture: NetworkArchitecture,
     num_networks: int,
     num_inputs: int,
     num_outputs: int,
@@ -67,7 +67,7 @@ def make_stack(
     """Make C networks with their parameters.
 
     Args:
-        form: their architecture.
+        architecture: their architecture.
         num_networks: C.
         num_inputs: n.
         num_outputs: of each.
@@ -79,14 +79,16 @@ def make_stack(
     Raises:
         NetworkError: a user's network does not meet the requirements.
     """
-    if form.factory is None and form.activation == "tanh":
-        sizes = (num_inputs, *form.hidden_sizes, num_outputs)
+    if architecture.factory is None and architecture.activation == "tanh":
+        sizes = (num_inputs, *architecture.hidden_sizes, num_outputs)
         parameters = FlatParameters([*TanhStack.shapes(num_networks, sizes), *others])
         stack = TanhStack(parameters, len(sizes) - 1)
-        stack.initialise(form.initialiser, last_scale, generator)
+        stack.initialise(architecture.initialiser, last_scale, generator)
         return parameters, stack
-    standard = perceptron(form.hidden_sizes, form.activation, form.initialiser, last_scale)
-    factory = form.factory or standard(generator)
+    standard = perceptron(
+        architecture.hidden_sizes, architecture.activation, architecture.initialiser, last_scale
+    )
+    factory = architecture.factory or standard(generator)
     with torch.random.fork_rng(devices=[]):  # a user's module draws from PyTorch's global generator
         torch.manual_seed(int(torch.randint(2**31, (1,), generator=generator)))
         modules = [checked_module(factory, num_inputs, num_outputs, role=role) for _ in range(num_networks)]

@@ -44,7 +44,7 @@ from recrl.orchestrator.errors import DamagedError, RecrlError, missing
 from recrl.orchestrator.files.atomic_files import write_atomically
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.trial_files import EVALUATION_COLUMNS, UPDATE_COLUMNS
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.untrusted import LimitValues, checked_name
 from recrl.orchestrator.validation_sentences import sentences
 
@@ -291,7 +291,7 @@ def _trial_facts(value: dict[str, Any], origins: list[str]) -> TrialFacts:
     trial = TrialFacts(
         **{**value, "spec": TrialSpec.from_json(value["spec"]), "provenance": origins[value["provenance"]]}
     )
-    return replace(trial, status=TrialState(trial.status))
+    return replace(trial, status=TrialStatus(trial.status))
 
 
 def _rounded(rows: pd.DataFrame) -> pd.DataFrame:

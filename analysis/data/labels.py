@@ -109,7 +109,7 @@ def keys_of(specs: Sequence[TrialSpec]) -> tuple[Keys, list[str]]:
         "method": ("curricula", METHOD_ORDER),
     }.items():
         of_name = [meaning[name] for meaning in meanings]
-        values, found = _told_apart(of_name, within, nouns)
+        values, found = _unique_labels(of_name, within, nouns)
         variants: dict[str, set[str]] = {}
         for meaning, value in zip(of_name, values, strict=True):
             variants.setdefault(meaning["label"], set()).add(value)
@@ -135,7 +135,7 @@ def _meanings(spec: TrialSpec) -> dict[str, Settings]:
     }
 
 
-def _told_apart(
+def _unique_labels(
     meanings: Sequence[Settings], within: Sequence[str], nouns: str
 ) -> tuple[list[str], list[str]]:
     """Return a label for every trial, unique to its settings, and a note for each label that was not.

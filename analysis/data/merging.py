@@ -15,7 +15,7 @@ import pandas as pd
 
 from recrl.analysis.data.labels import TRIAL, listed
 from recrl.analysis.data.sweep_data import ROWS, Sweep, TrialFacts, assemble
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 
 OUTCOMES = ("phases", "evaluations")  # data frames that every source has unrounded
 NAMED = 3  # largest number of trials in a note
@@ -55,10 +55,10 @@ def merge(parts: Sequence[Sweep]) -> Sweep:
 
 def _reached(trial: TrialFacts) -> tuple[bool, bool, int, bool]:
     return (
-        trial.status is not TrialState.DAMAGED,
-        trial.status is TrialState.COMPLETE,
+        trial.status is not TrialStatus.DAMAGED,
+        trial.status is TrialStatus.COMPLETE,
         trial.env_steps,
-        trial.status is not TrialState.WAITING,
+        trial.status is not TrialStatus.WAITING,
     )
 
 
@@ -95,7 +95,9 @@ def _disagreements(parts: Sequence[Sweep], having: Mapping[str, Sequence[int]]) 
 
 def _outcomes(part: Sweep) -> dict[str, str]:
     """Return the outcomes of the episodes of each complete trial, as text, by the trial's id."""
-    texts = {position: "" for position, trial in enumerate(part.facts) if trial.status is TrialState.COMPLETE}
+    texts = {
+        position: "" for position, trial in enumerate(part.facts) if trial.status is TrialStatus.COMPLETE
+    }
     for name in OUTCOMES:
         for key, rows in part.rows(name).groupby(TRIAL):
             position = cast(int, key)

@@ -56,7 +56,7 @@ from recrl.orchestrator.errors import DamagedError, RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import EPISODE_COLUMNS, EVALUATION_COLUMNS, UPDATE_COLUMNS
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.untrusted import checked_name
 
 TRIAL_COLUMNS = (
@@ -105,7 +105,7 @@ class TrialFacts:
     """
 
     spec: TrialSpec
-    status: TrialState
+    status: TrialStatus
     error: str = ""
     env_steps: int = 0
     cpu_seconds: float = 0.0
@@ -373,7 +373,7 @@ def _trials(store: SweepStore) -> tuple[list[TrialSpec], list[TrialStore]]:
 def _read(spec: TrialSpec, trial: TrialStore) -> tuple[TrialFacts, dict[str, pd.DataFrame]]:
     """Return a trial's facts and its rows of the data frames ROWS; no rows for a damaged trial."""
     record = trial.record()
-    if record.status is not TrialState.DAMAGED:
+    if record.status is not TrialStatus.DAMAGED:
         try:
             rows = {
                 "phases": pd.DataFrame(phase_totals(trial.episodes(), spec.deploy_limits.values)),
@@ -394,7 +394,7 @@ def _read(spec: TrialSpec, trial: TrialStore) -> tuple[TrialFacts, dict[str, pd.
             return facts, rows
         except DamagedError as error:
             record = replace(record, error=str(error).removeprefix(f"{trial.folder.name}: "))
-    damaged = TrialFacts(spec=spec, status=TrialState.DAMAGED, error=record.error)
+    damaged = TrialFacts(spec=spec, status=TrialStatus.DAMAGED, error=record.error)
     return damaged, {name: pd.DataFrame() for name in ROWS}
 
 

@@ -17,8 +17,13 @@ from recrl.orchestrator.files.curriculum_warnings import (
     landed_hard,
     no_curriculum_sentence,
 )
-from recrl.orchestrator.provenance.code_changes import InstalledCode, other_code, other_code_sentence
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.provenance.code_changes import (
+    InstalledCode,
+    compare,
+    missing_modules_sentence,
+    other_code_sentence,
+)
+from recrl.orchestrator.spec import TrialStatus
 
 BASELINE = "none"  # of ``metrics.comparisons``
 
@@ -27,18 +32,20 @@ _Codes = Mapping[str, set[str]]  # digests, by the name of the package
 
 def damages(sweep: Sweep) -> list[str]:
     """Return a sentence for each damaged trial, whose data are not in the data frames."""
-    return [f"{it.spec.title}: {it.error}" for it in sweep.facts if it.status is TrialState.DAMAGED]
+    return [f"{it.spec.title}: {it.error}" for it in sweep.facts if it.status is TrialStatus.DAMAGED]
 
 
 def doubts(sweep: Sweep) -> list[str]:
-    """Return sentences on trials of other code than is installed, on mixed code and ineffective curricula."""
+    """Return sentences on changed, missing and mixed code, and on ineffective curricula."""
     installed = InstalledCode()
-    changed = [it for it in sweep.facts if other_code(attempts(it), it.spec, installed)]
-    complete = sum(it.status is TrialState.COMPLETE for it in changed)
-    code = other_code_sentence(complete, len(changed) - complete)
-    if code and sweep.folder is None:
-        code += ", in a sweep's own folder"
-    return [*filter(None, (code, mixed_code_sentence(sweep))), *curriculum_warnings(sweep)]
+    codes = [compare(attempts(it), it.spec, installed) for it in sweep.facts]
+    changed = [it for it, code in zip(sweep.facts, codes, strict=True) if code.differs]
+    complete = sum(it.status is TrialStatus.COMPLETE for it in changed)
+    other = other_code_sentence(complete, len(changed) - complete)
+    if other and sweep.folder is None:
+        other += ", in a sweep's own folder"
+    missing = missing_modules_sentence(code.missing for code in codes)
+    return [*filter(None, (other, missing, mixed_code_sentence(sweep))), *curriculum_warnings(sweep)]
 
 
 def mixed_code_sentence(sweep: Sweep) -> str:
@@ -84,11 +91,11 @@ def _cells(groups: Sequence[tuple[str, str, str]]) -> str:
 def curriculum_warnings(sweep: Sweep) -> list[str]:
     """Sentences on curricula that had no effect or ended far above d_d."""
     flags = curriculum_flags(sweep)
-    said = (
+    sentences = (
         no_curriculum_sentence(_titles(flags, "no_curriculum")),
         hard_landing_sentence(_titles(flags, "hard_landing")),
     )
-    return [sentence for sentence in said if sentence]
+    return [sentence for sentence in sentences if sentence]
 
 
 def curriculum_flags(sweep: Sweep) -> pd.DataFrame:

@@ -22,7 +22,7 @@ from recrl.analysis.statistics.intervals import performance_profile
 from recrl.analysis.statistics.metrics import Measure
 from recrl.analysis.statistics.verdicts import SOLVED_GAP
 from recrl.environments.cmdp import Floats
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 
 
 def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
@@ -39,7 +39,7 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
     rows = rows[rows["measure"] == measure.value]
     if not len(rows):
         return None
-    failed = sweep.trials[sweep.trials["status"] == TrialState.FAILED.value]
+    failed = sweep.trials[sweep.trials["status"] == TrialStatus.FAILED.value]
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
     ended = pd.concat([rows[["task", "agent"]], failed[["task", "agent"]]])
     tasks, agents = occurring(ended["task"]), occurring(ended["agent"])

@@ -68,7 +68,8 @@ from recrl.analysis.statistics.curves import MEAN, CurveAverage, interquartile
 from recrl.analysis.statistics.intervals import ENOUGH_RUNS
 from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.errors import RecrlError, described
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.files.outcomes_file import FAILED, INFEASIBLE
+from recrl.orchestrator.spec import TrialStatus
 
 RELOAD_SECONDS = 120  # of the page of a sweep that runs
 CAPTIONS = {
@@ -244,7 +245,7 @@ def _list(sentences: Sequence[str]) -> list[str]:
 
 def _marked(table: pd.DataFrame) -> pd.DataFrame:
     """Return the verdict table with violations and failures in bold."""
-    bad = (verdict_texts.INFEASIBLE, verdict_texts.FAILED)
+    bad = (INFEASIBLE, FAILED)
     texts = [f"**{text}**" if any(word in text for word in bad) else text for text in table["verdict"]]
     return table.assign(verdict=texts)
 
@@ -341,13 +342,13 @@ def missing(sweep: Sweep) -> list[str]:
     for agent in _without_episodes(sweep):
         sentences.append(f"{agent}: no episode has finished, so there are no learning curves")
     for status, what in (
-        (TrialState.DAMAGED, "damaged"),
-        (TrialState.FAILED, "failed"),
-        (TrialState.RUNNING, "still running"),
-        (TrialState.WAITING, "waiting to be run"),
+        (TrialStatus.DAMAGED, "damaged"),
+        (TrialStatus.FAILED, "failed"),
+        (TrialStatus.RUNNING, "still running"),
+        (TrialStatus.WAITING, "waiting to be run"),
     ):
         chosen = sweep.trials[sweep.trials["status"] == status.value]
-        if status is TrialState.WAITING and (blank := chosen["env_steps"] == 0).any():
+        if status is TrialStatus.WAITING and (blank := chosen["env_steps"] == 0).any():
             sentences.append(f"{blank.sum()} trials: not begun yet")
             chosen = chosen[~blank]
         for _, row in chosen.iterrows():
@@ -369,13 +370,13 @@ def missing(sweep: Sweep) -> list[str]:
 def _count(sweep: Sweep) -> str:
     """Count trials by status: ``20 trials: 1 running, 19 complete.``."""
     counts = sweep.trials["status"].value_counts()
-    states = [f"{counts[state.value]} {state.value}" for state in TrialState if counts.get(state.value)]
+    states = [f"{counts[state.value]} {state.value}" for state in TrialStatus if counts.get(state.value)]
     return f"{len(sweep.trials)} trials: {', '.join(states)}."
 
 
 def _html(sweep: Sweep, drawn: list[Path], figures: Mapping[str, Drawing], tables: Tables) -> str:
     """Return the page: answers, verdicts, warnings and the first figures; the rest is folded."""
-    failed = bool(sweep.trials["status"].isin([TrialState.FAILED.value, TrialState.DAMAGED.value]).any())
+    failed = bool(sweep.trials["status"].isin([TrialStatus.FAILED.value, TrialStatus.DAMAGED.value]).any())
     sentences = [_count(sweep), *missing(sweep)]
     files = _full_sizes(drawn)
     first = {path: file for path, file in files.items() if figures[path.stem].kind in SKETCHED}
@@ -392,7 +393,7 @@ def _html(sweep: Sweep, drawn: list[Path], figures: Mapping[str, Drawing], table
         Section("Settings", settings, folded=True),
         Section("Provenance", html_page.verbatim("\n".join(_provenance(sweep))), folded=True),
     ]
-    goes_on = bool((sweep.trials["status"] == TrialState.RUNNING.value).any())
+    goes_on = bool((sweep.trials["status"] == TrialStatus.RUNNING.value).any())
     return html_page.page(
         sweep.name,
         _opening(sweep, tables.verdicts),

@@ -23,8 +23,8 @@ from recrl.analysis.statistics.intervals import ENOUGH_RUNS
 from recrl.analysis.statistics.metrics import Measure
 from recrl.analysis.statistics.verdict_counts import count_verdicts
 from recrl.analysis.statistics.verdicts import SOLVED_GAP
+from recrl.orchestrator.files.outcomes_file import OUTCOMES_FILE
 
-OUTCOMES = "outcomes.csv"
 COST_AND_BOUNDS = "Cumulative cost of training against its bounds"
 COST_AND_LIMITS = "Cumulative cost of training against the limits in force"
 BOOTSTRAP_SEED = 0
@@ -134,7 +134,7 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     shown += [_bounds(costs, suffix) for costs, suffix in zip(bounds, suffixes, strict=True) if len(costs)]
     written += [
         table_formats.write_csv(judged, folder / "verdicts.csv"),
-        table_formats.write_csv(rows, folder / OUTCOMES),
+        table_formats.write_csv(rows, folder / OUTCOMES_FILE),
         table_formats.write_csv(whole, folder / "summary.csv"),
         table_formats.write_csv(compared, folder / "comparisons.csv"),
         table_formats.write_text("\n".join(latex), folder / "outcomes.tex"),
@@ -153,7 +153,7 @@ def write_outcomes(sweep: Sweep, folder: Path) -> list[Path]:
         The file; nothing is written before a trial is complete.
     """
     rows = metrics.outcomes(sweep)
-    return [table_formats.write_csv(rows, folder / OUTCOMES)] if len(rows) else []
+    return [table_formats.write_csv(rows, folder / OUTCOMES_FILE)] if len(rows) else []
 
 
 def _claims(counted_claims: pd.DataFrame) -> ShownTable:

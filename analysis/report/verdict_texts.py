@@ -14,13 +14,13 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report.table_formats import not_corrected, with_interval
 from recrl.analysis.statistics.verdicts import COST_TOLERANCE, SOLVED_GAP, is_cost
 from recrl.environments.registry import TASKS
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.files.outcomes_file import FAILED, FEASIBLE, INFEASIBLE, PENDING, SOLVED
+from recrl.orchestrator.spec import TrialStatus
 
 DEPLOYMENT = "deployment phase (learning goes on)"
 BASELINE = "none"
 DIFFERENCE = "difference to none"
-SOLVED, FEASIBLE, INFEASIBLE = "solved", "feasible", "infeasible"
-FAILED, PENDING, UNEVALUATED = "failed", "no result yet", "not evaluated"
+UNEVALUATED = "not evaluated"
 WARNINGS = {
     "no_curriculum": (
         "curriculum without effect",
@@ -45,9 +45,9 @@ def no_verdict(sweep: Sweep) -> str:
         sweep: without an evaluated final policy.
     """
     status = sweep.trials["status"]
-    if (status == TrialState.COMPLETE.value).any():
+    if (status == TrialStatus.COMPLETE.value).any():
         return NOT_EVALUATED
-    failed = int((status == TrialState.FAILED.value).sum())
+    failed = int((status == TrialStatus.FAILED.value).sum())
     if failed == len(status):
         all_trials = f"all {failed} trials" if failed > 1 else "the only trial"
         return f"No verdict: {all_trials} failed."

@@ -35,7 +35,7 @@ from recrl.analysis.statistics.intervals import (
 from recrl.analysis.statistics.metrics import Measure
 from recrl.analysis.statistics.verdicts import ROUNDING, solved, within_limits
 from recrl.environments.cmdp import Floats
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 
 STATIC = ("linear", "cosine", "exponential")
 CURRICULA = (*STATIC, "dynamic")
@@ -165,7 +165,7 @@ def count_claims(rows: pd.DataFrame, training: pd.DataFrame, trials: pd.DataFram
     final, deployed = (
         rows[rows["measure"] == measure.value] for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
     )
-    complete = set(_keys(trials[trials["status"] == TrialState.COMPLETE.value]))
+    complete = set(_keys(trials[trials["status"] == TrialStatus.COMPLETE.value]))
     costs = training[np.array([key in complete for key in _keys(training)], dtype=bool)]
     costs = costs.assign(**{TRAINING_COST: costs["cost_0_total"] / costs["episodes"]})
     lines = []
@@ -230,7 +230,7 @@ def _of_all(rows: pd.DataFrame, claim: Claim, trials: pd.DataFrame) -> pd.Series
 
 
 def _failed_seeds(trials: pd.DataFrame) -> set[int]:
-    return set(trials.loc[trials["status"] == TrialState.FAILED.value, "seed"])
+    return set(trials.loc[trials["status"] == TrialStatus.FAILED.value, "seed"])
 
 
 def _compared(

@@ -28,7 +28,7 @@ from recrl.analysis.statistics.intervals import (
 )
 from recrl.analysis.statistics.verdicts import is_cost, solved, tie, within_limits
 from recrl.environments.cmdp import Phase
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 
 BASELINE = "none"  # the method that others are compared with
 
@@ -65,7 +65,7 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
     costs = [f"cost_{i}" for i in range(sweep.num_costs)]
     final = _with_exact(_frozen(sweep, costs), sweep.exact)
     measured = pd.concat([_deployment(sweep, costs), final], ignore_index=True)
-    complete = sweep.trials[sweep.trials["status"] == TrialState.COMPLETE.value]
+    complete = sweep.trials[sweep.trials["status"] == TrialStatus.COMPLETE.value]
     limits = [f"deploy_limit_{i}" for i in range(sweep.num_costs)]
     rows = measured.merge(
         complete[[*KEY, "trial_id", "cpu_seconds", *limits, "optimal_return"]], on=list(KEY)
@@ -127,7 +127,7 @@ def summary(rows: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
     measured = rows.groupby("task", observed=True)["measure"].agg(set).to_dict()
     lines = []
     for group, planned in trials.groupby(list(GROUP), observed=True, sort=False):
-        failed = int((planned["status"] == TrialState.FAILED.value).sum())
+        failed = int((planned["status"] == TrialStatus.FAILED.value).sum())
         of_task = measured.get(group[0], {Measure.STOCHASTIC.value})  # none: every trial of the task failed
         for measure in (it.value for it in Measure if it.value in of_task):
             chosen = found.get((*group, measure), rows.iloc[:0])

@@ -16,9 +16,10 @@ import pandas as pd
 from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.statistics.metrics import Measure
 from recrl.analysis.statistics.verdicts import is_cost, within_limit
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.files.outcomes_file import VERDICT_MEASURE
+from recrl.orchestrator.spec import TrialStatus
 
-FINAL = Measure.STOCHASTIC
+FINAL = Measure(VERDICT_MEASURE)
 
 
 def count_verdicts(
@@ -95,7 +96,7 @@ def _counts(seeds: pd.DataFrame) -> dict[str, int]:
 def _states(status: pd.Series[str]) -> dict[str, int]:
     """Count the trials of a group: all of them, the failed ones, and those that have not ended."""
     complete, failed = (
-        int((status == state.value).sum()) for state in (TrialState.COMPLETE, TrialState.FAILED)
+        int((status == state.value).sum()) for state in (TrialStatus.COMPLETE, TrialStatus.FAILED)
     )
     return {"planned": len(status), "failed": failed, "pending": len(status) - complete - failed}
 

@@ -27,7 +27,16 @@ from recrl.agents.registry import AGENTS
 from recrl.environments.plugins import load_attribute
 from recrl.environments.registry import TASKS
 from recrl.orchestrator.cli.arguments import parser
-from recrl.orchestrator.grid.file_models import Entry, Exclusion, GridFile, Resources, Run, TaskEntry
+from recrl.orchestrator.grid.file_models import (
+    REQUIRED,
+    Entry,
+    Exclusion,
+    GridFile,
+    Resources,
+    Run,
+    ShownDefault,
+    TaskEntry,
+)
 from recrl.teachers.registry import TEACHERS
 
 NOTE = "<!-- made from the code by docs/_ext/generated_reference.py; changes here are lost -->\n\n"
@@ -230,13 +239,19 @@ def option_table(model: type[BaseModel], *, only: Iterable[str] | None = None) -
         return ["It has no options of its own."]
     rows = ["| option | type | default | meaning |", "|---|---|---|---|"]
     for name in wanted:
-        field = schema["properties"][name]
-        required = name in schema.get("required", ())
+        field, declared = schema["properties"][name], model.model_fields[name]
+        shown = [it.text for it in declared.metadata if isinstance(it, ShownDefault)]
+        default = REQUIRED if name in schema.get("required", ()) else default_text(field)
         rows.append(
-            f"| `{name}` | {type_text(name, field, schema)} | {default_text(field, required=required)} "
-            f"| {cell(field.get('description', ''))} |"
+            f"| `{name}` | {type_text(name, field, schema)} | {code(shown[0]) if shown else default} "
+            f"| {cell(declared.description)} |"
         )
     return rows
+
+
+def code(default: str) -> str:
+    """Return a default as code, but the word that there is none as it is."""
+    return default if default == REQUIRED else f"`{default}`"
 
 
 def type_text(name: str, field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
@@ -261,13 +276,11 @@ def words(field: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
     return f"{TYPES.get(str(field.get('type')), 'any')} {bounds}".rstrip(" ,")
 
 
-def default_text(field: Mapping[str, Any], *, required: bool) -> str:
-    """Return an option's default."""
-    if required:
-        return "required"
+def default_text(field: Mapping[str, Any]) -> str:
+    """Return an option's default; nothing for a mapping."""
     if "default" not in field or isinstance(field["default"], dict):
         return ""
-    return f"`{json.dumps(field['default'])}`"
+    return code(json.dumps(field["default"]))
 
 
 def cell(text: str | None) -> str:

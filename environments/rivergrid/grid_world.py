@@ -97,7 +97,7 @@ class RiverGridMapOptions(RiverGridOptions):
 
 
 class RiverGridGeneratedOptions(RiverGridOptions, InstanceSettings):
-    """Options of ``rivergrid-generated``: a random instance with the properties of the paper's two."""
+    """Options of ``rivergrid-generated``: a random instance with the properties of 1a or 1b."""
 
     @model_validator(mode="after")
     def _goal_is_in_reach(self) -> Self:
@@ -222,7 +222,7 @@ class RiverGridVectorEnv(FiniteVectorEnv):
 
 
 def task_map(name: str, options: RiverGridOptions) -> RiverMap:
-    """Return the map of a task: one of the paper's, or that of the options."""
+    """Return the map of a task: 1a, 1b, or that of the options."""
     if isinstance(options, RiverGridMapOptions | RiverGridGeneratedOptions):
         return options.river_map()
     return parse_map(MAPS[name.removeprefix("rivergrid-")])

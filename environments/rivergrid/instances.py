@@ -1,4 +1,4 @@
-"""Random RiverGrid instances with the properties of the paper's two, by rules independent of agents.
+"""Random RiverGrid instances with the properties of 1a or 1b, by rules independent of agents.
 
 A river of varying width runs through the whole map, from north to south or from west to east. The start is on
 one bank and the goal on the other. Either there is a safe path around the river, as on 1b, or there is none,
@@ -55,11 +55,11 @@ class InstanceSettings(Options):
     """Settings of a generated instance."""
 
     map_seed: int = Field(ge=0, description="Seed of the map; equal settings give equal maps (ours).")
-    width: int = Field(default=9, ge=5, le=32, description="Columns, walls included (9 in the paper's maps).")
-    height: int = Field(default=9, ge=5, le=32, description="Rows, walls included (9 in the paper's maps).")
+    width: int = Field(default=9, ge=5, le=32, description="Columns, walls included (9 on 1a and 1b).")
+    height: int = Field(default=9, ge=5, le=32, description="Rows, walls included (9 on 1a and 1b).")
     river_width: tuple[int, int] = Field(
         default=(2, 5),
-        description="Least and largest width of the river in tiles (5 in the paper's maps).",
+        description="Least and largest width of the river in tiles (5 on 1a and 1b).",
     )
     wall_share: float = Field(
         default=0.1, ge=0.0, le=0.5, description="Probability that a tile is an inner wall (ours)."
@@ -138,7 +138,7 @@ def _shortest(river_map: RiverMap, *, step: tuple[int, int], wet: tuple[int, int
 
 
 def is_instance(river_map: RiverMap, settings: InstanceSettings, *, safe_path: bool) -> bool:
-    """Whether a map has the properties of the paper's two.
+    """Whether a map has the properties of 1a or 1b.
 
     - The goal can be reached.
     - The shortest path leads through the river and costs at least the river's least width, so the

@@ -1,4 +1,4 @@
-"""Maps of RiverGrid as text: the paper's two and a parser; ``instances`` generates random ones.
+"""Maps of RiverGrid as text: 1a, 1b and a parser; ``instances`` generates random ones.
 
 A map is a rectangle of characters, enclosed by walls:
 
@@ -25,7 +25,8 @@ TILES = WALL + GROUND + GOAL + STARTS
 STEPS: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))  # step forward by heading; y grows downwards
 
 
-# The paper's figure 1: the river is crossed at a cost of 5 (1a), or also bypassed at a cost of 0 (1b).
+# Ours, after the paper's figure 1. The river is crossed at a cost of 5 (1a), or also bypassed at a cost of 0
+# (1b).
 MAPS = {
     "1a": """
         #########

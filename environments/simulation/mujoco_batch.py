@@ -1,6 +1,7 @@
 """Many MuJoCo simulations of one model, stepped together, with exact save and restore.
 
-They are one MuJoCo batch (``mjbatch.h``, MuJoCo 4), used through its C interface, on MuJoCo's own threads.
+They are one MuJoCo batch (``mjbatch.h``, MuJoCo 4), used through its C interface (``mujoco_library``), on
+MuJoCo's own threads.
 MuJoCo's Python class ``mujoco.batch.Batch`` cannot put sleeping bodies back to sleep, and sleep is no part of
 a state row. Here ``load`` does, so that a simulation with sleeping bodies continues to the last bit.
 
@@ -12,11 +13,9 @@ Notation: B simulations; n numbers in a state row.
 from __future__ import annotations
 
 import ctypes
-import functools
 import os
 import weakref
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -25,11 +24,11 @@ import numpy.typing as npt
 
 from recrl.environments.cmdp import Floats
 from recrl.environments.saved_state import SavedState
+from recrl.environments.simulation.mujoco_library import BatchConfig, BatchFunction, library
 
 Integers = npt.NDArray[np.int32]
 Ids = Sequence[int] | npt.NDArray[np.intp] | None
 
-_BatchFunction = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p)
 _NUM_WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
 BAD_STATES = [
     int(mujoco.mjtWarning.mjWARN_BADQPOS),
@@ -38,55 +37,6 @@ BAD_STATES = [
 ]
 _EVERYTHING, _NOTHING = int(mujoco.mjtStage.mjSTAGE_ACC), int(mujoco.mjtStage.mjSTAGE_NONE)
 ROW = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-
-
-class _Config(ctypes.Structure):
-    """``mjBatchConfig``."""
-
-    _fields_ = (("nthread", ctypes.c_int), ("persistent", ctypes.c_bool))
-
-
-@functools.cache
-def _library() -> Any:
-    """Load MuJoCo's shared library, and declare the types of the functions that are used here."""
-    folder = Path(mujoco.__file__).parent
-    found = [path for pattern in ("libmujoco*", "mujoco.dll") for path in sorted(folder.glob(pattern))]
-    if not found:
-        raise ImportError(f"MuJoCo's shared library must lie in {folder.name}, found none")
-    library = ctypes.CDLL(str(found[0]))
-    pointer, integer = ctypes.c_void_p, ctypes.c_int
-    signatures: dict[str, tuple[Any, tuple[Any, ...]]] = {
-        "mjb_makeBatch": (
-            pointer,
-            (pointer, integer, ctypes.POINTER(_Config), ctypes.c_char_p, integer),
-        ),
-        "mjb_deleteBatch": (None, (pointer,)),
-        "mjb_nstate": (integer, (pointer,)),
-        "mjb_state": (pointer, (pointer,)),
-        "mjb_stateComponent": (pointer, (pointer, integer, ctypes.POINTER(integer))),
-        "mjb_warning": (pointer, (pointer,)),
-        "mjb_status": (pointer, (pointer,)),
-        "mjb_output": (
-            pointer,
-            (pointer, ctypes.c_char_p, ctypes.POINTER(integer), ctypes.POINTER(integer)),
-        ),
-        "mjb_step": (integer, (pointer, pointer, integer, integer, integer)),
-        "mjb_rollout": (
-            integer,
-            (pointer, pointer, integer, integer, pointer, integer, pointer, integer),
-        ),
-        "mjb_forward": (integer, (pointer, pointer, integer, integer)),
-        "mjb_reset": (integer, (pointer, pointer, integer, pointer, integer)),
-        "mjb_error": (ctypes.c_char_p, (pointer, integer)),
-        "mjb_getData": (None, (pointer, integer, pointer)),
-        "mjb_apply": (integer, (pointer, pointer, integer, pointer, pointer, integer)),
-        "mj_updateSleep": (None, (pointer, pointer)),
-        "mj_copyData": (pointer, (pointer, pointer, pointer)),
-    }
-    for name, (result, arguments) in signatures.items():
-        function = getattr(library, name)
-        function.restype, function.argtypes = result, arguments
-    return library
 
 
 class PhysicsError(RuntimeError):
@@ -102,9 +52,9 @@ class _Batch:
     """
 
     def __init__(self, model: mujoco.MjModel, number: int, num_threads: int) -> None:
-        config = _Config(nthread=num_threads, persistent=True)
+        config = BatchConfig(nthread=num_threads, persistent=True)
         reason = ctypes.create_string_buffer(1000)
-        address = _library().mjb_makeBatch(model._address, number, ctypes.byref(config), reason, len(reason))
+        address = library().mjb_makeBatch(model._address, number, ctypes.byref(config), reason, len(reason))
         if not address:
             raise PhysicsError(f"MuJoCo cannot simulate this model in a batch: {reason.value.decode()}")
         self.address = int(address)
@@ -144,7 +94,7 @@ class Simulations:
         self.model = model
         self.number = number
         self._num_threads = num_threads
-        self._library = _library()
+        self._library = library()
         self._batch = _Batch(model, number, num_threads)
         self._data = mujoco.MjData(model)
         address = self._batch.address
@@ -276,7 +226,7 @@ class Simulations:
             def put_back(model: int, data: int, *_: Any, source: int = restored._address) -> None:
                 self._library.mj_copyData(data, model, source)
 
-            function = ctypes.cast(_BatchFunction(put_back), ctypes.c_void_p)
+            function = ctypes.cast(BatchFunction(put_back), ctypes.c_void_p)
             self._check(self._library.mjb_apply, [index], function, None, 1)
         self._check(self._library.mjb_forward, None, _NOTHING)  # copies the outputs
         self._warnings[:, :, 1] = warnings
@@ -376,4 +326,4 @@ class Simulations:
 def _delete(address: int, process: int, num_threads: int) -> None:
     """Free a batch, but not in a forked process: MuJoCo would wait for threads that do not exist there."""
     if num_threads == 1 or process == os.getpid():
-        _library().mjb_deleteBatch(address)
+        library().mjb_deleteBatch(address)

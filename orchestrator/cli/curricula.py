@@ -17,7 +17,7 @@ from recrl.orchestrator.errors import USERS_ERRORS, DamagedError, RecrlError, de
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.only_selection import parse_only, select
-from recrl.orchestrator.spec import Choice, TrialState
+from recrl.orchestrator.spec import Choice, TrialStatus
 from recrl.orchestrator.validation_sentences import NotJsonError, require_json, sentences
 from recrl.teachers.registry import find_teacher, teacher_config
 
@@ -78,7 +78,7 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
     damaged = []
     for trial in (store.trial(spec) for spec in specs):
         record = trial.record()
-        if record.status is TrialState.DAMAGED:
+        if record.status is TrialStatus.DAMAGED:
             damaged.append(f"{trial.title}: {record.error}")
         elif record.committed.get(trial.updates_path.name, 0):
             try:

@@ -19,7 +19,7 @@ from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.counting import counted
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.launch_plan import Estimate, Plan, PlannedAction
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, TrialProgress
 
 TERMINAL_SECONDS = 1.0
@@ -137,7 +137,7 @@ def failures(trials: Iterable[TrialProgress], folder_of: Callable[[TrialProgress
 def damages_of_plan(plan: Plan) -> Iterator[str]:
     """Describe every damaged trial, with the damage and the remedy."""
     for trial in plan.trials:
-        if trial.record.status is TrialState.DAMAGED:
+        if trial.record.status is TrialStatus.DAMAGED:
             yield f"damaged: {trial.spec.title}: {trial.record.error}"
 
 

@@ -15,8 +15,13 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.only_selection import parse_only, select
-from recrl.orchestrator.provenance.code_changes import InstalledCode, has_other_code, other_code_sentence
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.provenance.code_changes import (
+    InstalledCode,
+    compare_files,
+    missing_modules_sentence,
+    other_code_sentence,
+)
+from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
@@ -80,12 +85,15 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
 
 
 def _warn_of_other_code(evaluated: Sequence[SavedTrial], console: Console) -> None:
-    """Print the number of trials that ran other code than evaluated them."""
+    """Print the numbers of trials that ran other code than evaluated them, or code that is not found."""
     installed = InstalledCode()
-    changed = [saved for saved in evaluated if has_other_code(saved.store, saved.spec, installed)]
-    complete = sum(saved.store.record().status is TrialState.COMPLETE for saved in changed)
+    codes = [compare_files(saved.store, saved.spec, installed) for saved in evaluated]
+    changed = [saved for saved, code in zip(evaluated, codes, strict=True) if code.differs]
+    complete = sum(saved.store.record().status is TrialStatus.COMPLETE for saved in changed)
     if sentence := other_code_sentence(complete, len(changed) - complete):
         say(console, f"warning: {sentence}; these evaluations use the installed code")
+    if sentence := missing_modules_sentence(code.missing for code in codes):
+        say(console, f"warning: {sentence}")
 
 
 def _film(

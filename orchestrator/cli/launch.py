@@ -13,12 +13,13 @@ from rich.console import Console
 from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import say, short, show
 from recrl.orchestrator.cli.plan import say_other_code, say_plan, selection_of
-from recrl.orchestrator.cli.requests import DEFAULT_ROOT, LaunchRequest
+from recrl.orchestrator.cli.requests import LaunchRequest
 from recrl.orchestrator.cli.status import say_failures
 from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
@@ -148,7 +149,7 @@ def _say_results(sweep: Sweep, console: Console) -> None:
 
 def _root_of(options: LaunchOptions) -> list[str]:
     """Return the arguments that name the folder of all sweeps, unless it is the default."""
-    return [] if options.root == DEFAULT_ROOT else ["--root", str(options.root)]
+    return [] if options.root == Path(DEFAULT_ROOT) else ["--root", str(options.root)]
 
 
 def _say_synced(outcome: LaunchOutcome, uri: str, options: LaunchOptions, console: Console) -> None:

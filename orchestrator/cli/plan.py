@@ -20,9 +20,9 @@ from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.grid.only_selection import parse_only
 from recrl.orchestrator.launch_grid import room
 from recrl.orchestrator.launch_plan import Plan, TrialSelection, estimate, kind_of, make_plan, unmeasured
-from recrl.orchestrator.provenance.code_changes import other_code_sentence
+from recrl.orchestrator.provenance.code_changes import missing_modules_sentence, other_code_sentence
 from recrl.orchestrator.remote.remote_sweep import sweep_place
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 
 
 def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
@@ -115,8 +115,12 @@ def _warn_of_deployment(specs: Sequence[TrialSpec], console: Console) -> None:
 
 
 def say_other_code(plan: Plan, console: Console) -> None:
-    """Print the number of trials that ran other code than is installed now."""
+    """Print the numbers of trials that ran other code than is installed now, or code that is not found."""
     changed = plan.other_code
-    complete = sum(trial.record.status is TrialState.COMPLETE for trial in changed)
-    if sentence := other_code_sentence(complete, len(changed) - complete):
+    complete = sum(trial.record.status is TrialStatus.COMPLETE for trial in changed)
+    sentences = (
+        other_code_sentence(complete, len(changed) - complete),
+        missing_modules_sentence(plan.missing_modules),
+    )
+    for sentence in filter(None, sentences):
         say(console, f"warning: {sentence}")

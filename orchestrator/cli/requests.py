@@ -14,10 +14,10 @@ from typing import Any, ClassVar
 
 from recrl.orchestrator.cli import argument_types as types
 from recrl.orchestrator.cli.argument_fields import Request, by_flag, by_place
+from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 
 VIDEOS = ("gif", "mp4")
 TEMPLATES = ("demo", "safety-gym", "velocity", "own-task")
-DEFAULT_ROOT = Path("runs")
 KINDS = ("tasks", "agents", "curricula", "methods")  # methods: the key in a grid
 SWEEP_HELP = "a sweep's name, folder or grid file; optional if there is only one"
 
@@ -54,9 +54,9 @@ class PlaceRequest(Request):
 
     root: Path = by_flag(
         type=types.folder,
-        default=DEFAULT_ROOT,
+        default=Path(DEFAULT_ROOT),
         metavar="FOLDER",
-        help="the folder of all sweeps (default: runs)",
+        help=f"the folder of all sweeps (default: {DEFAULT_ROOT})",
     )
     storage: str | None = by_flag(
         type=types.address, metavar="URI", help=f"read the sweep from {_STORE}; {_COPY}"

@@ -14,7 +14,7 @@ from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid.checking import read_name
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.tracking.client import checked_uri
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def say_warnings(sweep: Sweep, console: Console) -> None:
 
 
 def _say_file(path: Path, sweep: Sweep, console: Console) -> None:
-    complete = sum(trial.status is TrialState.COMPLETE for trial in sweep.facts)
+    complete = sum(trial.status is TrialStatus.COMPLETE for trial in sweep.facts)
     size = f"{path.stat().st_size / 1000:,.0f} kB"
     say(console, f"{short(path)}: {counted(len(sweep.facts), 'trial')}, {complete} of them complete, {size}")
 

@@ -25,7 +25,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.launch_plan import make_plan
 from recrl.orchestrator.run_sweep import REQUEST_SECONDS
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.sweep_progress import (
     DisplayStatus,
     SweepProgress,
@@ -58,7 +58,7 @@ def _warn_of_curricula(now: SweepProgress, store: SweepStore, console: Console) 
     none = [it.spec.title for it in now.trials if it.spec.is_no_curriculum(it.record.start_limits)]
     hard = []
     for trial in now.trials:
-        if trial.record.status is TrialState.DAMAGED:  # it is printed above
+        if trial.record.status is TrialStatus.DAMAGED:  # it is printed above
             continue
         try:
             if landed_hard(trial.spec, _events(trial, store)):
@@ -106,7 +106,7 @@ def run_check(request: CheckRequest, console: Console) -> ExitCode:
 def _is_lost(trial: TrialStore) -> bool:
     """Whether the object store has nothing of a trial that can be used, so that its copy must be kept."""
     try:
-        return trial.stated().status is TrialState.DAMAGED
+        return trial.stated().status is TrialStatus.DAMAGED
     except StorageError:
         return False
 
@@ -155,12 +155,12 @@ def run_logs(request: LogsRequest, console: Console) -> ExitCode:
 
 def _wait_for_start(store: SweepStore, text: str, console: Console) -> None:
     """Wait until a matching trial has begun, as long as a launch runs that may begin it."""
-    told = False
+    is_said = False
     begun = (DisplayStatus.RUNNING, DisplayStatus.COMPLETE, DisplayStatus.FAILED, DisplayStatus.DAMAGED)
     while store.is_locked() and not any(_status(store, it) in begun for it in _meant(store, text)):
-        if not told:
+        if not is_said:
             say(console, f"{store.name}: waiting for {f'a trial {text!r}' if text else 'a trial'} to start")
-        told = True
+        is_said = True
         time.sleep(display.LOG_SECONDS)
 
 

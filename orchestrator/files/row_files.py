@@ -198,8 +198,8 @@ def _difference(found: Collection[str], expected: Collection[str]) -> str:
     """Describe a difference of columns: ``kl is missing; entropy is new``."""
     missing = [name for name in expected if name not in found]
     new = [name for name in found if name not in expected]
-    said = [f"{', '.join(missing)} missing" if missing else "", f"{', '.join(new)} new" if new else ""]
-    return "; ".join(filter(None, said))
+    parts = [f"{', '.join(missing)} missing" if missing else "", f"{', '.join(new)} new" if new else ""]
+    return "; ".join(filter(None, parts))
 
 
 def _first_line(path: Path, length: int) -> tuple[str, ...]:

@@ -171,9 +171,9 @@ class SweepStore:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         lines = "".join(json.dumps(spec.to_json(), allow_nan=False) + "\n" for spec in specs).encode()
-        told = {"name": self.name, "created": self._created(), "trials": len(specs)}
-        told |= {"lines": Extent.of(lines).sha256, "grid": Extent.of(grid_text).sha256}
-        header = sealed(told, version=SPECS_FORMAT)
+        contents = {"name": self.name, "created": self._created(), "trials": len(specs)}
+        contents |= {"lines": Extent.of(lines).sha256, "grid": Extent.of(grid_text).sha256}
+        header = sealed(contents, version=SPECS_FORMAT)
         if grid_text:
             write_atomically(self.grid_path, grid_text)
         write_atomically(self.specs_path, (json.dumps(header) + "\n").encode() + lines)
@@ -204,15 +204,15 @@ class SweepStore:
         """
         name = self.specs_path.name
         first, _, lines = read_whole(self.specs_path).partition(b"\n")
-        told = unsealed(first, name, version=SPECS_FORMAT)
-        if Extent.of(lines).sha256 != told["lines"]:
+        header = unsealed(first, name, version=SPECS_FORMAT)
+        if Extent.of(lines).sha256 != header["lines"]:
             raise DamagedError(f"{name} is not what was written: its checksum differs")
         created = self._created()
-        both_known = created is not None and told["created"] is not None
-        if told["created"] != created if both_known else told["name"] != self.name:
+        both_known = created is not None and header["created"] is not None
+        if header["created"] != created if both_known else header["name"] != self.name:
             raise DamagedError(f"{name} is not of this sweep, or {self.info_path.name} is not")
         try:
-            return told["grid"], [TrialSpec.from_json(json.loads(line)) for line in lines.splitlines()]
+            return header["grid"], [TrialSpec.from_json(json.loads(line)) for line in lines.splitlines()]
         except (ValueError, KeyError, TypeError) as error:
             raise DamagedError(f"{name} describes no trials ({error})") from error
 

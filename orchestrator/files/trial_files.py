@@ -11,6 +11,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+DEFAULT_ROOT = "runs"  # the folder of all sweeps, in the working directory
 EPISODE_COLUMNS = ("index", "phase", "end_step", "length", "episode_return", "noise")
 UPDATE_COLUMNS = (
     "update",

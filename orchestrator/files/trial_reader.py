@@ -22,7 +22,7 @@ from recrl.orchestrator.files.atomic_files import parsed_object, read_sealed
 from recrl.orchestrator.files.row_files import Extent, digest_of, shortage
 from recrl.orchestrator.files.trial_files import EVALUATION_COLUMNS, TrialFiles
 from recrl.orchestrator.files.trial_record import TrialRecord
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 
 RECORD_FORMAT = 2
 SPEC_FORMAT = 2
@@ -78,8 +78,8 @@ class TrialReader(TrialFiles):
             stated, wrong = self._looked_at(self._short)
         except StorageError as error:
             return self._damaged(TrialRecord(), error)
-        if stated.status is TrialState.DAMAGED:
-            return replace(stated, claims=TrialState.COMPLETE)  # it must not run again
+        if stated.status is TrialStatus.DAMAGED:
+            return replace(stated, claims=TrialStatus.COMPLETE)  # it must not run again
         return self._damaged(stated, wrong) if wrong else stated
 
     def _looked_at(self, look: Callable[[TrialRecord], Found]) -> tuple[TrialRecord, Found]:
@@ -141,15 +141,15 @@ class TrialReader(TrialFiles):
         claims = stated.status if stated.attempt else None
         if isinstance(error, OtherFormatError):
             claims = (
-                TrialState.COMPLETE
+                TrialStatus.COMPLETE
             )  # the status is unknown: the trial must not run again without a request
         if self.is_local_copy:
             remedy = "the sweep's folder is only a local copy: delete it, and it is fetched again"
-        elif claims in (TrialState.COMPLETE, TrialState.FAILED):
+        elif claims in (TrialStatus.COMPLETE, TrialStatus.FAILED):
             remedy = "launch --rerun-damaged runs the trial again and moves the damaged files aside"
         else:
             remedy = "the next launch continues from the intact files and moves the damaged ones aside"
-        return replace(stated, status=TrialState.DAMAGED, claims=claims, error=f"{error}; {remedy}")
+        return replace(stated, status=TrialStatus.DAMAGED, claims=claims, error=f"{error}; {remedy}")
 
     def damages(self) -> list[str]:
         """Return a sentence for each file that differs from its commit, by lengths and digests.
@@ -162,7 +162,7 @@ class TrialReader(TrialFiles):
             return [str(error)]
 
     def _wrong_files(self, record: TrialRecord) -> Iterator[str]:
-        if record.status is TrialState.DAMAGED:
+        if record.status is TrialStatus.DAMAGED:
             yield record.error
         for name, extent in record.extents.items():
             try:
@@ -191,7 +191,7 @@ class TrialReader(TrialFiles):
     def verified_record(self) -> TrialRecord:
         """Return ``record``, after a check of every file's digest."""
         record = self.record()
-        found = self.damages() if record.status is not TrialState.DAMAGED else []
+        found = self.damages() if record.status is not TrialStatus.DAMAGED else []
         return self._damaged(record, DamagedError(found[0])) if found else record
 
     def require_whole(self) -> None:
@@ -201,7 +201,7 @@ class TrialReader(TrialFiles):
             DamagedError: a file is damaged; the sentence names it and the remedy.
         """
         record = self.verified_record()
-        if record.status is TrialState.DAMAGED:
+        if record.status is TrialStatus.DAMAGED:
             raise DamagedError(f"{self.title}: {record.error}")
 
     def committed_bytes(self, path: Path) -> bytes:

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from recrl.orchestrator.files.row_files import Extent
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class TrialRecord:
         claims: for a damaged trial, the status in its files, or None; not stored.
     """
 
-    status: TrialState = TrialState.WAITING
+    status: TrialStatus = TrialStatus.WAITING
     attempt: int = 0
     token: str = ""
     update: int = 0
@@ -55,7 +55,7 @@ class TrialRecord:
     checkpoint: str = ""
     start_limits: list[float | str] | None = None
     error: str = ""
-    claims: TrialState | None = None
+    claims: TrialStatus | None = None
 
     @property
     def extents(self) -> dict[str, Extent]:
@@ -69,7 +69,7 @@ class TrialRecord:
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> TrialRecord:
         """Return the record of ``to_json``."""
-        return cls(**{**value, "status": TrialState(value["status"])})
+        return cls(**{**value, "status": TrialStatus(value["status"])})
 
 
 def as_fields(extents: Mapping[str, Extent]) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from recrl.orchestrator.files.trial_reader import RECORD_FORMAT, SPEC_FORMAT, Tr
 from recrl.orchestrator.files.trial_record import TrialRecord, as_fields
 from recrl.orchestrator.files.trial_writer import PROVENANCE_FORMAT, TrialWriter
 from recrl.orchestrator.process_scope import process_scope
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 
 RESERVE_BYTES = 16 * 1024  # room for a record and a traceback
 
@@ -100,7 +100,7 @@ class TrialStore(TrialReader):
             record = replace(
                 old,
                 **as_fields(extents),
-                status=TrialState.RUNNING,
+                status=TrialStatus.RUNNING,
                 attempt=old.attempt + 1,
                 token=secrets.token_hex(8),
                 total_steps=spec.total_steps,
@@ -219,7 +219,7 @@ class TrialStore(TrialReader):
             path.rename(place / path.name)
         self.rerun_path.unlink()
 
-    def set_status(self, status: TrialState, *, error: str = "") -> None:
+    def set_status(self, status: TrialStatus, *, error: str = "") -> None:
         """Set the status of a trial whose process can no longer do so, or died before its attempt began.
 
         This revokes the lease of any writer.
@@ -233,7 +233,7 @@ class TrialStore(TrialReader):
             self.reserve_path.unlink(missing_ok=True)
             self._set_status(status, error)
 
-    def _set_status(self, status: TrialState, error: str) -> None:
+    def _set_status(self, status: TrialStatus, error: str) -> None:
         with self.locked():
             self._set_all_aside_on_request()
             try:

@@ -26,7 +26,7 @@ from recrl.orchestrator.files.atomic_files import write_atomically, write_sealed
 from recrl.orchestrator.files.row_files import Extent, RowFile, csv_line, rows_text
 from recrl.orchestrator.files.trial_files import EPISODE_COLUMNS
 from recrl.orchestrator.files.trial_record import TrialRecord, as_fields
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 
 if TYPE_CHECKING:
     from recrl.orchestrator.files.trial_store import TrialStore
@@ -233,7 +233,7 @@ class TrialWriter:
         with self._lease():
             self._write_record(update=update, env_steps=env_steps, steps_per_second=steps_per_second)
 
-    def close(self, status: TrialState, *, error: str = "", traceback: str = "") -> None:
+    def close(self, status: TrialStatus, *, error: str = "", traceback: str = "") -> None:
         """End this attempt: complete, failed with an error, or waiting to be resumed."""
         with self._lease():
             self.store.reserve_path.unlink(missing_ok=True)

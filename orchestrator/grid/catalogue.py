@@ -21,18 +21,18 @@ from recrl.environments.plugins import UnknownNameError, nearest
 from recrl.environments.registry import TASKS, find_task, options_model
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.grid.file_models import (
+    REQUIRED,
     DeployLimits,
     Entry,
     Limits,
     Resources,
     Run,
+    ShownDefault,
     TaskEntry,
     TrainLimits,
 )
 from recrl.orchestrator.validation_sentences import model_in
 from recrl.teachers.registry import TEACHERS, find_teacher
-
-REQUIRED = "required"
 
 
 @dataclass(frozen=True)
@@ -173,12 +173,13 @@ def _options(model: type[BaseModel], defaults: BaseModel | None, prefix: str) ->
         value = (
             getattr(defaults, name) if defaults is not None else field.get_default(call_default_factory=True)
         )
-        default = REQUIRED if value is PydanticUndefined else _json(value)
+        shown = (it.text for it in field.metadata if isinstance(it, ShownDefault))
+        default = next(shown, REQUIRED if value is PydanticUndefined else _json(value))
         yield Option(f"{prefix}{name}", type_text(field.annotation), default, field.description or "")
         inner = model_in(field.annotation)
         if inner is not None:
-            shown = value if isinstance(value, BaseModel) else None
-            yield from _options(inner, shown, f"{prefix}{name}.")
+            inner_defaults = value if isinstance(value, BaseModel) else None
+            yield from _options(inner, inner_defaults, f"{prefix}{name}.")
 
 
 def _json(value: Any) -> str:

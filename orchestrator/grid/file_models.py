@@ -10,6 +10,7 @@ import math
 import re
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -27,6 +28,7 @@ from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.untrusted import PlainText, ShortText
 from recrl.orchestrator.validation_sentences import as_written
 
+REQUIRED = "required"
 MAX_SEEDS = 10_000
 MAX_STEPS = 10**12
 
@@ -154,6 +156,17 @@ CustomResources = Annotated[
 ]
 
 
+@dataclass(frozen=True)
+class ShownDefault:
+    """What reference and ``recrl-sweep options`` show as the default of a key; ``None`` in its model.
+
+    Attributes:
+        text: the default as JSON, or ``required``.
+    """
+
+    text: str
+
+
 class _Written(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -182,13 +195,15 @@ class Entry(_Written):
 class Limits(_Written):
     """The limits of a task's costs: one number for all costs, or a list with one number per cost."""
 
-    train_limits: TrainLimits | None = Field(
+    train_limits: Annotated[TrainLimits | None, ShownDefault('"auto"')] = Field(
         default=None,
-        description="Training limits d_t: 'auto' (the default: the curriculum measures them), a number for "
-        "every cost, or a list.",
+        description="Training limits d_t, at the task or for all tasks: 'auto' (the curriculum measures "
+        "them), a number for every cost, or a list.",
     )
-    deploy_limits: DeployLimits | None = Field(
-        default=None, description="Deployment limits d_d: a number for every cost, or a list."
+    deploy_limits: Annotated[DeployLimits | None, ShownDefault(REQUIRED)] = Field(
+        default=None,
+        description="Deployment limits d_d, at the task or for all tasks: a number for every cost, or a "
+        "list.",
     )
 
 
@@ -267,10 +282,12 @@ class Resources(_Written):
 class Exclusion(_Written):
     """Trials to leave out: those that match everything given here; labels, and seeds."""
 
-    task: Labels | None = None
-    agent: Labels | None = None
-    method: Labels | None = None
-    seed: Annotated[list[Whole], BeforeValidator(_listed), _AT_LEAST_ONE, _one_or_list(_COUNT)] | None = None
+    task: Labels | None = Field(default=None, description="Labels of tasks; by default all.")
+    agent: Labels | None = Field(default=None, description="Labels of agents; by default all.")
+    method: Labels | None = Field(default=None, description="Labels of methods; by default all.")
+    seed: Annotated[list[Whole], BeforeValidator(_listed), _AT_LEAST_ONE, _one_or_list(_COUNT)] | None = (
+        Field(default=None, description="Seeds; by default all.")
+    )
 
     def matches(self, spec: TrialSpec) -> bool:
         """Whether the trial is left out."""
@@ -289,10 +306,14 @@ class GridFile(Limits):
     """Content of a grid file; its limits apply to tasks without their own."""
 
     name: SweepName = Field(description="Name of the sweep and of its folder.")
-    tasks: list[TaskEntry] = Field(min_length=1)
-    agents: list[Entry] = Field(min_length=1)
-    methods: list[Entry] = Field(min_length=1)
+    tasks: list[TaskEntry] = Field(min_length=1, description="The tasks, as names or mappings.")
+    agents: list[Entry] = Field(min_length=1, description="The agents, as names or mappings.")
+    methods: list[Entry] = Field(min_length=1, description="The curricula, as names or mappings.")
     seeds: Seeds = Field(description="A number of seeds (5 for 0 to 4), or a list of seeds.")
-    run: Run
-    resources: Resources = Resources()
-    exclude: list[Exclusion] = []
+    run: Run = Field(description="Length and width of every trial.")
+    resources: Resources = Field(
+        default=Resources(), description="Resources of a trial; no result depends on them."
+    )
+    exclude: list[Exclusion] = Field(
+        default=[], description="Trials to leave out: those that match all keys of an entry."
+    )

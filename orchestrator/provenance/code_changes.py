@@ -3,7 +3,8 @@
 A trial's results depend on recrl's tasks, agents, curricula and training loop, not on figures or commands:
 only the former are in the digest. A user's task, agent or curriculum has a digest of its top-level package
 (all Python files) or single module. Each module of the user's project that it imports, directly or through
-others, has one too. Nothing is imported to find them: import statements are read from the files.
+others, has one too. Nothing is imported to find them: import statements are read from the files. So modules
+in the working directory are found also where a command may not import them.
 
 The project is the nearest folder above the module that holds a project file or a repository, else the
 module's own folder. Installed packages, the standard library and imports by a computed name are left out.
@@ -16,12 +17,15 @@ import functools
 import importlib.machinery
 import importlib.util
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from importlib.machinery import ModuleSpec
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 from recrl.agents.registry import AGENTS
+from recrl.environments.plugins import modules_folder
 from recrl.environments.registry import TASKS
 from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import StorageError
@@ -75,30 +79,45 @@ def code_of(spec: TrialSpec) -> dict[str, str]:
     return InstalledCode().of(spec)
 
 
-def other_code(
+@dataclass(frozen=True)
+class CodeComparison:
+    """The code that a trial ran, compared with the code that is installed now.
+
+    Attributes:
+        differs: whether an attempt ran other code; False if unknown.
+        missing: the top-level packages and modules that it ran and that are not found now. So it is unknown
+            whether their code differs. Empty if other code differs.
+    """
+
+    differs: bool = False
+    missing: frozenset[str] = frozenset()
+
+
+def compare(
     attempts: Iterable[Mapping[str, Any]], spec: TrialSpec, installed: InstalledCode | None = None
-) -> bool:
-    """Whether an attempt of a trial ran other code than is installed now; False if unknown.
+) -> CodeComparison:
+    """Compare the code that a trial ran with the code that is installed now.
 
     Args:
         attempts: of ``TrialStore.provenance``.
         spec: the trial.
         installed: shared by the trials of one pass; None to read the code for this one.
     """
+    ran = [(name, digest) for attempt in attempts for name, digest in attempt.get("code", {}).items()]
     now = (installed or InstalledCode()).of(spec)
-    for attempt in attempts:
-        code = attempt.get("code", {})
-        if any(name in now and digest != now[name] for name, digest in code.items()):
-            return True
-    return False
+    if any(name in now and digest != now[name] for name, digest in ran):
+        return CodeComparison(differs=True)
+    return CodeComparison(missing=frozenset(name for name, _ in ran if name not in now))
 
 
-def has_other_code(trial: TrialStore, spec: TrialSpec, installed: InstalledCode | None = None) -> bool:
-    """Apply ``other_code`` to the trial's files; False if these are damaged."""
+def compare_files(
+    trial: TrialStore, spec: TrialSpec, installed: InstalledCode | None = None
+) -> CodeComparison:
+    """Apply ``compare`` to the trial's files; nothing differs or is missing if these are damaged."""
     try:
-        return other_code(trial.provenance(), spec, installed)
+        return compare(trial.provenance(), spec, installed)
     except StorageError:
-        return False
+        return CodeComparison()
 
 
 def other_code_sentence(complete: int, begun: int) -> str:
@@ -120,6 +139,23 @@ def other_code_sentence(complete: int, begun: int) -> str:
     return (
         f"{' and '.join(parts)} {comes} from other code than is installed now; launch --rerun-changed runs "
         f"{them} again"
+    )
+
+
+def missing_modules_sentence(missing: Iterable[Collection[str]]) -> str:
+    """Describe trials whose code could not be compared; empty for none.
+
+    Args:
+        missing: ``CodeComparison.missing`` of each trial.
+    """
+    lacking = [names for names in missing if names]
+    if not lacking:
+        return ""
+    first, *others = sorted(set().union(*lacking))
+    missing = f"{first} and {counted(len(others), 'other')} were" if others else f"{first} was"
+    return (
+        f"the code of {counted(len(lacking), 'trial')} was not checked for changes, because the module "
+        f"{missing} not found; start the command in the folder that holds {'them' if others else 'it'}"
     )
 
 
@@ -184,7 +220,7 @@ def _files_of(package: str, project: Path | None = None) -> dict[str, Path]:
         project: the folder of a project; None to look everywhere.
     """
     try:
-        spec = importlib.util.find_spec(package)
+        spec = importlib.util.find_spec(package) or _spec_in_modules_folder(package)
     except (ImportError, ValueError):
         return {}
     if spec is None:
@@ -197,6 +233,12 @@ def _files_of(package: str, project: Path | None = None) -> dict[str, Path]:
     if not folders and spec.origin and spec.origin.endswith(tuple(importlib.machinery.SOURCE_SUFFIXES)):
         files = {Path(spec.origin).name: Path(spec.origin)}
     return files
+
+
+def _spec_in_modules_folder(package: str) -> ModuleSpec | None:
+    """Find a package or module in the folder that ``import_module`` searches last; import nothing."""
+    folder = modules_folder()
+    return None if folder is None else importlib.machinery.PathFinder.find_spec(package, [folder])
 
 
 def _project_of(package: str, files: Mapping[str, Path]) -> Path | None:

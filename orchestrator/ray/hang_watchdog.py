@@ -16,7 +16,7 @@ import ray
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.process_scope import is_own_scope
 from recrl.orchestrator.ray.tune_trial import spec_of
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.sweep_place import SweepPlace
 
 HEARTBEAT_READ_SECONDS = 2.0  # smallest time between two reads of the heartbeats
@@ -69,7 +69,7 @@ class HangWatchdog:
                 continue
             has_spoken = sign != self._before.get(trial.trial_id)
             patience = self._seconds * (1 if has_spoken else STARTUP_GRACE_FACTOR)
-            if now - heard_at > patience and (record.status is TrialState.RUNNING or not has_spoken):
+            if now - heard_at > patience and (record.status is TrialStatus.RUNNING or not has_spoken):
                 self._heard[trial.trial_id] = (sign, float("inf"))  # once per silence
                 logger.warning("%s: no sign of work for %.0f seconds", spec.title, patience)
                 _end_process(record if has_spoken else None, trial.temporary_state.ray_actor)

@@ -26,7 +26,7 @@ from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
 from recrl.orchestrator.ray.services import LostServices
 from recrl.orchestrator.ray.tune_trial import spec_of
 from recrl.orchestrator.redaction import shown
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.sweep_place import SweepPlace
 
 LONGEST_PAUSE_SECONDS = 0.5  # in which Ray is not asked whether a trial has ended
@@ -102,7 +102,7 @@ class DriverWatch(tune.Callback):
         if not isinstance(cause, TeacherUnavailableError) and not is_over:
             error = shown(process_error(cause, trial.num_failures))
             try:
-                files.set_status(TrialState.FAILED, error=error)
+                files.set_status(TrialStatus.FAILED, error=error)
             except StorageError as also:
                 logger.warning("%s; %s", error, also)
 

@@ -32,10 +32,10 @@ from recrl.orchestrator.remote.remote_trial import (
     size_of,
 )
 from recrl.orchestrator.remote.retries import retry_while_down
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 
 FOLDER_CHECK_SECONDS = 0.5  # between two checks of the trial's folder
-ALIVE_SECONDS = 15.0  # between two signs of life
+ALIVE_SECONDS = 15.0  # between two heartbeats
 KEPT_COMMITS = 2  # a reader may still use the last but one
 
 logger = logging.getLogger("recrl.trial")
@@ -59,10 +59,10 @@ class Upload:
         self._written: set[str] = set()
         self._number = 0
         self._shown: tuple[Any, ...] | None = None
-        self._spoke_at = float("-inf")
+        self._heartbeat_sent = float("-inf")
 
     def follow(self) -> None:
-        """Send new commits, if any, and regularly a sign of life.
+        """Send new commits, if any, and regularly a heartbeat.
 
         Raises:
             StorageError: the store cannot be written; nothing is lost, the next call tries again.
@@ -71,8 +71,8 @@ class Upload:
         record = self._own_record()
         if record is None:
             return
-        if self._shown is None or time.monotonic() >= self._spoke_at + ALIVE_SECONDS:
-            self._speak(record)
+        if self._shown is None or time.monotonic() >= self._heartbeat_sent + ALIVE_SECONDS:
+            self._send_heartbeat(record)
         if self._shown != _commit_of(record):
             self.push()
 
@@ -81,7 +81,7 @@ class Upload:
         record = self._own_record()
         if record is None:
             return
-        self._speak(replace(record, heartbeat=time.time()))  # uploads may take long
+        self._send_heartbeat(replace(record, heartbeat=time.time()))  # uploads may take long
         self.push()
         self._remote.objects.delete([f"{attempt_of(record)}/{ALIVE}"])
 
@@ -111,7 +111,7 @@ class Upload:
 
     def revoke(self) -> None:
         """Revoke the trial's lease, so that its attempt ends."""
-        self._trial.set_status(TrialState.WAITING)
+        self._trial.set_status(TrialStatus.WAITING)
 
     def _write(self, key: str, data: bytes) -> None:
         """Write a commit's object; if that fails, delete what was written of it, if the store lets us."""
@@ -123,11 +123,11 @@ class Upload:
                     self._remote.objects.delete([key])
             raise
 
-    def _speak(self, record: TrialRecord) -> None:
-        """Send a sign of life. Only a commit may record the end."""
-        said = replace(record, status=TrialState.RUNNING)
-        self._remote.objects.write(f"{attempt_of(record)}/{ALIVE}", _json(said.to_json()))
-        self._spoke_at = time.monotonic()
+    def _send_heartbeat(self, record: TrialRecord) -> None:
+        """Send a heartbeat. Only a commit may record the end."""
+        alive = replace(record, status=TrialStatus.RUNNING)
+        self._remote.objects.write(f"{attempt_of(record)}/{ALIVE}", _json(alive.to_json()))
+        self._heartbeat_sent = time.monotonic()
 
     def _capture(self) -> tuple[TrialRecord, dict[str, tuple[Piece, ...]], dict[str, tuple[int, bytes]]]:
         """Return the record, the sent pieces and the new bytes; the caller holds the trial's lock.

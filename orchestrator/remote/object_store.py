@@ -43,7 +43,7 @@ class ObjectStore:
         _require_package(self.uri, protocol)
         self._in_folder = protocol in FOLDERS
         options: dict[str, Any] = {"auto_mkdir": True} if self._in_folder else {}
-        with self._speaking("cannot be used"):
+        with self._as_storage_error("cannot be used"):
             self._system, path = fsspec.url_to_fs(self.uri, skip_instance_cache=True, **options)
         self._root = path.rstrip("/")
 
@@ -67,7 +67,7 @@ class ObjectStore:
         Raises:
             StorageError: the store does not answer, or refuses.
         """
-        with self._speaking("cannot be read", unless=FileNotFoundError):
+        with self._as_storage_error("cannot be read", unless=FileNotFoundError):
             return bytes(self._system.cat_file(self._path(key), start=start, end=end))
         return None
 
@@ -78,7 +78,7 @@ class ObjectStore:
             StorageError: the store does not answer, or refuses.
         """
         path = self._path(key)
-        with self._speaking("cannot be written"):
+        with self._as_storage_error("cannot be written"):
             if not self._in_folder:
                 self._system.pipe_file(path, data)
                 return
@@ -96,7 +96,7 @@ class ObjectStore:
             StorageError: the store does not answer, or refuses.
         """
         path = self._path(key)
-        with self._speaking("cannot be written"):
+        with self._as_storage_error("cannot be written"):
             try:
                 self._system.pipe_file(path, data, mode="create")
             except FileExistsError:
@@ -114,7 +114,7 @@ class ObjectStore:
             StorageError: the store does not answer, or refuses.
         """
         place = self._path(folder).rstrip("/")
-        with self._speaking("cannot be listed", unless=FileNotFoundError):
+        with self._as_storage_error("cannot be listed", unless=FileNotFoundError):
             self._system.invalidate_cache()  # other processes write here, too
             found = self._system.find(place)
             return sorted(path[len(place) + 1 :] for path in found if path.startswith(f"{place}/"))
@@ -126,7 +126,7 @@ class ObjectStore:
         Raises:
             StorageError: the store does not answer, or refuses.
         """
-        with self._speaking("cannot be listed", unless=FileNotFoundError):
+        with self._as_storage_error("cannot be listed", unless=FileNotFoundError):
             self._system.invalidate_cache()
             entries = self._system.ls(self._root, detail=True)
             paths = (entry["name"].rstrip("/") for entry in entries if entry["type"] == kind)
@@ -140,7 +140,7 @@ class ObjectStore:
             StorageError: the store does not answer, or refuses.
         """
         for key in keys:
-            with self._speaking("cannot be cleared", unless=FileNotFoundError):
+            with self._as_storage_error("cannot be cleared", unless=FileNotFoundError):
                 self._system.rm_file(self._path(key))
 
     def probe(self) -> None:
@@ -161,7 +161,7 @@ class ObjectStore:
         return f"{self._root}/{key}"
 
     @contextmanager
-    def _speaking(self, what: str, unless: type[Exception] | None = None) -> Iterator[None]:
+    def _as_storage_error(self, what: str, unless: type[Exception] | None = None) -> Iterator[None]:
         """Turn a package's errors into one sentence, except those that end the process."""
         try:
             yield

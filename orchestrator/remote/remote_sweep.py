@@ -38,7 +38,7 @@ from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_trial import ALIVE, RemoteTrial
 from recrl.orchestrator.remote.retries import repeat_until, retry_while_down
 from recrl.orchestrator.remote.stop_object import StopObject
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.sweep_place import SweepPlace
 
 PULL_SECONDS = 10.0  # between two reads of the running trials
@@ -283,9 +283,9 @@ class RemoteSweep(SweepPlace):
     def _send_dead_trial(self, spec: TrialSpec) -> None:
         trial = self.store.trial(spec)
         record = trial.record()
-        if record.token or record.status not in (TrialState.FAILED, TrialState.WAITING):
+        if record.token or record.status not in (TrialStatus.FAILED, TrialStatus.WAITING):
             return
-        if record.status is TrialState.WAITING and not record.attempt:
+        if record.status is TrialStatus.WAITING and not record.attempt:
             return  # never begun
         remote = self.trial(spec.folder_name)
         remote.download(trial, checkpoints=False)

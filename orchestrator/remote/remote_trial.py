@@ -48,7 +48,7 @@ from recrl.orchestrator.remote.commit_format import (
     unpack,
 )
 from recrl.orchestrator.remote.object_store import ObjectStore
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 
 COMMIT_TRIES = 3  # wait for a newer commit, before a damaged one is reported
 COMMIT_PAUSE_SECONDS = 0.25  # between two of them
@@ -117,8 +117,8 @@ class RemoteTrial:
             _record_damage(trial, newest, error)
             return
         record = commit.record if commit else TrialRecord()
-        told = attempt_of(record)  # the keys may be older than the commit
-        works = newest > told or (newest == told and record.status is TrialState.RUNNING)
+        attempt = attempt_of(record)  # the keys may be older than the commit
+        works = newest > attempt or (newest == attempt and record.status is TrialStatus.RUNNING)
         if ALIVE in attempts[newest] and works:
             record = _with_life(record, self.objects.read(f"{newest}/{ALIVE}"))
         if record.attempt == 0:
@@ -126,8 +126,8 @@ class RemoteTrial:
         trial.folder.mkdir(parents=True, exist_ok=True)
         with trial.locked():
             here = trial.record()
-            silent = record.status is TrialState.RUNNING
-            is_verdict = here.token == "" and here.status is not TrialState.DAMAGED
+            silent = record.status is TrialStatus.RUNNING
+            is_verdict = here.token == "" and here.status is not TrialStatus.DAMAGED
             ended_here = is_verdict and here.attempt >= record.attempt and silent
             if not ended_here and here != record:
                 trial.write_record(record)
@@ -292,7 +292,7 @@ def _record_damage(trial: TrialStore, newest: str, error: DamagedError) -> None:
     with trial.locked():
         here = trial.record()
         attempt = max(here.attempt, int(newest.partition("-")[0]))
-        record = replace(here, status=TrialState.DAMAGED, attempt=attempt, error=str(error))
+        record = replace(here, status=TrialStatus.DAMAGED, attempt=attempt, error=str(error))
         if record != here:
             trial.write_record(record)
 

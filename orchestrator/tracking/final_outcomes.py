@@ -14,14 +14,19 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from recrl.orchestrator.files.outcomes_file import (
+    FAILED,
+    FEASIBLE,
+    INFEASIBLE,
+    OUTCOMES_FILE,
+    PENDING,
+    SOLVED,
+    VERDICT_MEASURE,
+)
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.tracking.positions import file_mark
-
-FILE_NAME = "outcomes.csv"  # in the sweep's figures folder
-MEASURE = "stochastic"  # the measure of the report's verdicts
-SOLVED, FEASIBLE, INFEASIBLE = "solved", "feasible", "infeasible"
 
 
 @dataclass(frozen=True)
@@ -78,7 +83,7 @@ class FinalOutcomes:
 
     def __init__(self, store: SweepStore) -> None:
         self._store = store
-        self._path = store.figures_folder / FILE_NAME
+        self._path = store.figures_folder / OUTCOMES_FILE
         self._mark = ""
         self._found: dict[str, FinalOutcome] = {}  # by trial id, as labels may be those of an earlier grid
 
@@ -91,7 +96,7 @@ class FinalOutcomes:
         """
         self._refresh()
         found = self._found.get(spec.trial_id)
-        if found is None or record.status is not TrialState.COMPLETE:
+        if found is None or record.status is not TrialStatus.COMPLETE:
             return None
         is_of_this_run = found.cpu_seconds is None or found.cpu_seconds == record.cpu_seconds
         return found if is_of_this_run else None
@@ -114,7 +119,8 @@ class FinalOutcomes:
         evaluated = (spec for spec in self._store.specs() if spec.evaluation_episodes)
         records = ((spec, self._store.trial(spec).record()) for spec in evaluated)
         return any(
-            record.status is TrialState.COMPLETE and self.of(spec, record) is None for spec, record in records
+            record.status is TrialStatus.COMPLETE and self.of(spec, record) is None
+            for spec, record in records
         )
 
     def has_sampled(self) -> bool:
@@ -128,7 +134,7 @@ class FinalOutcomes:
             if mark == self._mark:
                 return
             with self._path.open(encoding="utf-8", newline="") as file:
-                rows = [row for row in csv.DictReader(file) if row.get("measure") == MEASURE]
+                rows = [row for row in csv.DictReader(file) if row.get("measure") == VERDICT_MEASURE]
             outcomes = list(map(_outcome, rows))
         except FileNotFoundError:
             mark, outcomes = "", []
@@ -158,7 +164,7 @@ def trial_note(outcome: FinalOutcome, start_limits: Sequence[float]) -> str:
 
 
 def verdict_lines(
-    outcomes: Sequence[FinalOutcome], states: Mapping[tuple[str, str, str], Sequence[TrialState]]
+    outcomes: Sequence[FinalOutcome], states: Mapping[tuple[str, str, str], Sequence[TrialStatus]]
 ) -> list[str]:
     """Return the table of verdicts in Markdown, one row per task, agent and curriculum.
 
@@ -182,9 +188,9 @@ def verdict_lines(
     return lines
 
 
-def _verdicts(seeds: Sequence[FinalOutcome], states: Sequence[TrialState]) -> str:
+def _verdicts(seeds: Sequence[FinalOutcome], states: Sequence[TrialStatus]) -> str:
     """Count a group's verdicts: ``solved 2 of 5, infeasible 2 of 5 by up to 0.28, failed 1 of 5``."""
-    failed = states.count(TrialState.FAILED)
+    failed = states.count(TrialStatus.FAILED)
     total = len(states)
     parts = []
     for verdict in (SOLVED, FEASIBLE, INFEASIBLE):
@@ -194,7 +200,7 @@ def _verdicts(seeds: Sequence[FinalOutcome], states: Sequence[TrialState]) -> st
             up_to = "up to " if len(chosen) > 1 else ""
             by = f" by {up_to}{_text(max(it.excess for it in chosen))}" if verdict == INFEASIBLE else ""
             parts.append(f"{verdict}{count}{by}")
-    without = {"failed": failed, "no result yet": total - len(seeds) - failed}
+    without = {FAILED: failed, PENDING: total - len(seeds) - failed}
     for name, number in without.items():
         if number > 0:
             parts.append(f"{name} {number} of {total}" if number < total else name)

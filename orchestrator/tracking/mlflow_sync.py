@@ -29,7 +29,7 @@ from recrl.orchestrator.files.atomic_files import write_json
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.tracking.client import is_away, one_line
 from recrl.orchestrator.tracking.export_file import ExportWriter
 from recrl.orchestrator.tracking.final_outcomes import FinalOutcomes
@@ -85,8 +85,8 @@ def sync(
 def last_report(store: SweepStore, uri: str) -> SyncReport | None:
     """Return the report of the last finished pass of any process; None if there was none."""
     try:
-        told = json.loads((sync_folder(store, uri) / "report.json").read_text())
-        return SyncReport(**{key: told[key] for key in SyncReport.__dataclass_fields__ if key in told})
+        saved = json.loads((sync_folder(store, uri) / "report.json").read_text())
+        return SyncReport(**{key: saved[key] for key in SyncReport.__dataclass_fields__ if key in saved})
     except (OSError, ValueError, TypeError):
         return None
 
@@ -173,4 +173,4 @@ def _kept(problems: list[str], trial: TrialStore) -> Iterator[None]:
 
 def _has_begun(record: TrialRecord) -> bool:
     """Return whether there is, or was, a trial to show."""
-    return record.attempt > 0 or record.status is TrialState.DAMAGED
+    return record.attempt > 0 or record.status is TrialStatus.DAMAGED

@@ -10,7 +10,7 @@ from dataclasses import replace
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.sweep_progress import DisplayStatus, display_status, shown_record
 from recrl.orchestrator.tracking.chart_view import charts_page
 from recrl.orchestrator.tracking.export_file import ExportUpload, ExportWriter
@@ -118,9 +118,9 @@ class SweepSync:
 
 def _states(
     specs: Sequence[TrialSpec], records: Mapping[str, TrialRecord]
-) -> Mapping[tuple[str, str, str], list[TrialState]]:
+) -> Mapping[tuple[str, str, str], list[TrialStatus]]:
     """Return the states of trials by task, agent and curriculum."""
-    states: dict[tuple[str, str, str], list[TrialState]] = {}
+    states: dict[tuple[str, str, str], list[TrialStatus]] = {}
     for spec in specs:
         group = (spec.task.label, spec.agent.label, spec.method.label)
         states.setdefault(group, []).append(records[spec.folder_name].status)

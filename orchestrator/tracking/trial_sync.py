@@ -16,7 +16,7 @@ from recrl.orchestrator.errors import DamagedError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.tracking.final_outcomes import FinalOutcome, FinalOutcomes, trial_note
 from recrl.orchestrator.tracking.mlflow_runs import SweepRuns
 from recrl.orchestrator.tracking.positions import Position, file_mark, read_position, sync_folder
@@ -61,7 +61,7 @@ class TrialSync:
             DamagedError: a file of the trial differs from its commit.
         """
         record = trial.record()
-        if record.status is TrialState.DAMAGED:
+        if record.status is TrialStatus.DAMAGED:
             raise DamagedError(record.error)
         outcome = self._outcomes.of(trial.spec, record)
         status = trial_run_status(record, live=live, silence_seconds=silence_seconds)
@@ -109,21 +109,21 @@ class TrialSync:
         client, run_id = self._runs.client, position.run_id
         metrics: list[Metric] = [Metric(it.key, it.value, it.milliseconds, it.step) for it in new_points]
         is_new = run_id in self._runs.without_params
-        told = [Param(key, value) for key, value in params(trial.spec).items()] if is_new else []
+        new_params = [Param(key, value) for key, value in params(trial.spec).items()] if is_new else []
         try:
             position = self._runs.send_files(position, _result_files(trial, record))
             for path in _added_afterwards(trial):
                 position = self._runs.send_files(position, [path], path.parent.name)
         except OSError:  # points may fit even if there is no room for files
-            client.log_batch(run_id, metrics=metrics, params=told)
+            client.log_batch(run_id, metrics=metrics, params=new_params)
             raise
-        told_tags = {**state_tags(record), GROUP_TAG: group}
+        tag_values = {**state_tags(record), GROUP_TAG: group}
         if outcome is not None:
             start = record.start_limits or list(trial.spec.train_limits)
             text = trial_note(outcome, [float(limit) for limit in start])
-            told_tags |= {"recrl.verdict": outcome.verdict, "mlflow.note.content": text}
-        tags = [RunTag(key, value) for key, value in told_tags.items()]
-        client.log_batch(run_id, metrics=metrics, params=told, tags=tags)
+            tag_values |= {"recrl.verdict": outcome.verdict, "mlflow.note.content": text}
+        tags = [RunTag(key, value) for key, value in tag_values.items()]
+        client.log_batch(run_id, metrics=metrics, params=new_params, tags=tags)
         self._runs.without_params.discard(run_id)
         if position.shown.get("error") and not record.error:
             client.delete_tag(run_id, "recrl.error")
@@ -198,9 +198,9 @@ def _last_row(data: bytes, position: Position) -> Row:
 def _result_files(trial: TrialStore, record: TrialRecord) -> list[Path]:
     """Return the trial's small files, and at its end its policy."""
     paths = [trial.spec_path, trial.provenance_path]
-    if record.status is TrialState.COMPLETE:
+    if record.status is TrialStatus.COMPLETE:
         paths += [trial.evaluation_path, trial.events_path, trial.policy_path, *trial.checkpoints()[:1]]
-    if record.status is TrialState.FAILED:
+    if record.status is TrialStatus.FAILED:
         paths += [trial.error_path]
     return paths
 

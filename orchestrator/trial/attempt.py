@@ -23,7 +23,7 @@ from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.provenance.code_changes import code_of
 from recrl.orchestrator.provenance.versions import collect as collect_provenance
 from recrl.orchestrator.redaction import shown
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.trial.device import device_name, learning_on
 from recrl.orchestrator.trial.heartbeat import Heartbeat
 from recrl.orchestrator.trial.one_thread import one_thread
@@ -44,7 +44,7 @@ def run_trial(
     *,
     should_stop: Callable[[], bool],
     commit_seconds: float = COMMIT_SECONDS,
-) -> TrialState:
+) -> TrialStatus:
     """Run a trial to its end, or until ``should_stop``, from its newest checkpoint.
 
     Args:
@@ -83,12 +83,12 @@ def run_trial(
                 trial.save()
                 evaluated = True
     if not evaluated:
-        writer.close(TrialState.WAITING)
+        writer.close(TrialStatus.WAITING)
         logger.info("stopped after update %d; it can be resumed", trial.update)
-        return TrialState.WAITING
-    writer.close(TrialState.COMPLETE)
+        return TrialStatus.WAITING
+    writer.close(TrialStatus.COMPLETE)
     logger.info("complete: %d updates, %d environment steps", trial.update, trial.env_steps)
-    return TrialState.COMPLETE
+    return TrialStatus.COMPLETE
 
 
 class _SignsOfLife:
@@ -143,7 +143,7 @@ def run_recorded(
     teacher: Teacher | None = None,
     commit_seconds: float = COMMIT_SECONDS,
     on_gpu: bool = False,
-) -> TrialState:
+) -> TrialStatus:
     """Call ``run_trial``, and record the run in the trial's folder.
 
     A trial that raises is FAILED in its own files, with the traceback in ``error.txt``. Nothing is raised
@@ -173,7 +173,7 @@ def run_recorded(
         writer = store.begin(spec)
     except StorageError as error:
         logger.warning("%s", error)
-        return TrialState.WAITING
+        return TrialStatus.WAITING
     with _log_to(store):
         try:
             writer.add_provenance({**provenance, "device": device_name(on_gpu=on_gpu)})
@@ -188,18 +188,18 @@ def run_recorded(
         except LostLeaseError as error:
             logger.warning("%s", error)
         except TeacherUnavailableError:
-            _close(writer, TrialState.WAITING)
+            _close(writer, TrialStatus.WAITING)
             raise
         except StorageError as error:
             logger.error("%s", error)
-            return _close(writer, TrialState.WAITING, error=str(error))
+            return _close(writer, TrialStatus.WAITING, error=str(error))
         except USERS_ERRORS as error:
             if isinstance(error, SystemExit) and should_stop():  # a second signal to a stopping worker
-                return _close(writer, TrialState.WAITING)
+                return _close(writer, TrialStatus.WAITING)
             logger.exception("failed; its files end at update %d", writer.record.update)
             notes = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
             text = shown(f"{described(error)}{notes}")
-            return _close(writer, TrialState.FAILED, error=text, traceback=shown(traceback.format_exc()))
+            return _close(writer, TrialStatus.FAILED, error=text, traceback=shown(traceback.format_exc()))
         return store.record().status
 
 
@@ -214,7 +214,7 @@ def _cost_names(spec: TrialSpec) -> dict[str, list[str]]:
         return {}
 
 
-def _close(writer: TrialWriter, status: TrialState, *, error: str = "", traceback: str = "") -> TrialState:
+def _close(writer: TrialWriter, status: TrialStatus, *, error: str = "", traceback: str = "") -> TrialStatus:
     """End an attempt after an error; a failure to record it must not hide the error."""
     try:
         writer.close(status, error=error, traceback=traceback)

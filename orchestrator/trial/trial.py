@@ -272,8 +272,8 @@ class Trial:
     def _event(self, name: str, **details: Any) -> None:
         event = {"update": self.update, "end_step": self.env_steps, "event": name, **details}
         self._writer.append_event(event)
-        told = ", ".join(f"{key} {value}" for key, value in details.items())
-        logger.info("update %d: %s%s", self.update, name, f" ({told})" if told else "")
+        values = ", ".join(f"{key} {value}" for key, value in details.items())
+        logger.info("update %d: %s%s", self.update, name, f" ({values})" if values else "")
 
     def _state_dict(self) -> dict[str, Any]:
         return {

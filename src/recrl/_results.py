@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from recrl.environments.plugins import modules_here, refuse_import_paths
 from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 
 NO_POLICIES = "an export and MLflow hold no policies; load the sweep from the folder it ran in"
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 
 def load_sweep(
-    source: str | Path, name: str | None = None, *, root: str | Path = "runs", trust: bool = False
+    source: str | Path, name: str | None = None, *, root: str | Path = DEFAULT_ROOT, trust: bool = False
 ) -> Sweep:
     """Read a finished or running sweep as tidy tables.
 
@@ -138,7 +139,7 @@ def _folder_below(source: str | Path, trial_id: str) -> Path:
     """The folder of a trial of the sweep with this name or folder."""
     from recrl.orchestrator.find_sweep import find_sweep  # noqa: PLC0415
 
-    store = find_sweep(Path("runs"), str(source))
+    store = find_sweep(Path(DEFAULT_ROOT), str(source))
     trial = next((it for it in store.trials() if it.trial_id == trial_id), None)
     if trial is None:
         raise RecrlError(

@@ -21,9 +21,10 @@ from recrl.environments.plugins import modules_here
 from recrl.orchestrator.errors import NO_PATH, NO_ROOM, GridError, RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid, read_grid
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -68,7 +69,7 @@ def validate(grid: Grid, *, trust: bool = False) -> GridSpec:
 def launch(
     grid: Grid,
     *,
-    root: str | Path = "runs",
+    root: str | Path = DEFAULT_ROOT,
     executor: str = "ray",
     address: str | None = None,
     max_concurrent: int | None = None,
@@ -213,7 +214,7 @@ def train(
 def _require_complete(trial: TrialStore, title: str) -> None:
     """Raise the error of a trial that failed, with its traceback as a note."""
     record = trial.record()
-    if record.status is TrialState.COMPLETE:
+    if record.status is TrialStatus.COMPLETE:
         return
     failed = RecrlError(f"{title}: {record.error or 'is not complete'}")
     if trial.error_path.exists():

@@ -8,7 +8,7 @@ from gymnasium.spaces import Space
 
 from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
-from recrl.agents.networks.architecture import NetworkForm, orthogonal
+from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.environments.cmdp import Floats
 
 NUM_SAMPLES = 400
@@ -18,7 +18,7 @@ def sampled(space: Space[object]) -> tuple[StochasticPolicy, LearningBatch, Floa
     """A policy, what it did, and advantages: the reward likes what the first cost dislikes."""
     generator = np.random.default_rng(0)
     policy = StochasticPolicy(
-        3, space, NetworkForm((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0)
+        3, space, NetworkArchitecture((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0)
     )
     observations = generator.normal(size=(NUM_SAMPLES, 3)).astype(np.float32)
     actions = policy.sample(observations, generator)

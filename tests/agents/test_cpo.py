@@ -8,14 +8,15 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete, Space
 
-from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation, LocalModel, acceptance, improvement
+from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation, acceptance
 from recrl.agents.algorithms.own_options import CPOConfig
 from recrl.agents.algorithms.pcpo import projected_step
 from recrl.agents.experience import ActiveConstraints, Constraints, Experience
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import improve_and_measure
-from recrl.agents.networks.architecture import NetworkForm, orthogonal
+from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.agents.trust_region.cpo_dual import DualSolution, StepCase, StepProblem, solve_dual
+from recrl.agents.trust_region.local_model import LocalModel, improvement
 from recrl.environments.cmdp import Floats
 from tests.agents.sampled import sampled
 
@@ -39,7 +40,9 @@ def improve(
     rule = ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA, violation_integral_gain=0.0), 2)
     experience = Experience.of(policy, batch, advantages, constraints)
     metrics = improve_and_measure(rule, policy, experience, np.random.default_rng(0))
-    old = StochasticPolicy(3, space, NetworkForm((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0))
+    old = StochasticPolicy(
+        3, space, NetworkArchitecture((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0)
+    )
     rows = batch.unique_observations
     moved = old.distribution(rows).divergence(policy.distribution(rows))  # type: ignore[arg-type]
     metrics["kl"] = float(torch.dot(batch.observation_weights, moved))
@@ -175,7 +178,7 @@ def test_the_trust_region_bounds_the_divergence_of_the_new_policy_from_the_old()
         for each in (experience.old, policy.distribution(batch.unique_observations))
     )
     expected = torch.distributions.kl_divergence(old, new).sum(1).mean()
-    assert model.measure()[1] == pytest.approx(float(expected), rel=1e-5)
+    assert model.surrogates_and_divergence()[1] == pytest.approx(float(expected), rel=1e-5)
 
 
 class Measured:
@@ -184,10 +187,10 @@ class Measured:
     def __init__(self, after: list[float], divergence: float) -> None:
         self.after, self.divergence = np.array(after), divergence
 
-    def start(self) -> Floats:
+    def old_surrogates(self) -> Floats:
         return np.zeros(3)
 
-    def measure(self) -> tuple[Floats, float]:
+    def surrogates_and_divergence(self) -> tuple[Floats, float]:
         return self.after, self.divergence
 
 

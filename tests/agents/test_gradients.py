@@ -22,12 +22,12 @@ from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 from recrl.agents.networks import tanh_stack
-from recrl.agents.networks.architecture import NetworkForm, orthogonal
+from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.agents.networks.flat_parameters import FlatParameters
 from recrl.environments.cmdp import Floats
 
 SPACES = [Discrete(3), Box(-1.0, 1.0, (2,))]
-FORM = NetworkForm((5, 4), orthogonal)
+FORM = NetworkArchitecture((5, 4), orthogonal)
 CLIP = 0.1
 STEP = 1e-6
 

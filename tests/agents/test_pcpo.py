@@ -23,7 +23,7 @@ from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
-from recrl.agents.networks.architecture import NetworkForm, orthogonal
+from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.agents.trust_region.cpo_dual import StepCase, StepProblem, projection_weights
 from recrl.environments.cmdp import Floats
 
@@ -146,7 +146,7 @@ def improved(
     """The metrics of one update, and how the policy's parameters have changed."""
     generator = np.random.default_rng(0)
     policy = StochasticPolicy(
-        3, space, NetworkForm((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0)
+        3, space, NetworkArchitecture((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0)
     )
     observations = generator.normal(size=(400, 3)).astype(np.float32)
     actions = policy.sample(observations, generator)

@@ -9,10 +9,10 @@ from torch import Tensor
 from recrl.agents.learning.distributions import Categorical, Gaussian, mean_divergence
 from recrl.agents.learning.noise_scales import matching_log_std, matching_scale, off_greedy_mass
 from recrl.agents.learning.policies import FisherMetric, StochasticPolicy
-from recrl.agents.networks.architecture import NetworkForm, orthogonal
+from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.agents.networks.tanh_stack import TanhStack
 
-FORM = NetworkForm((5, 4), orthogonal)
+FORM = NetworkArchitecture((5, 4), orthogonal)
 THREE_ACTIONS = Discrete(3)
 TWO_COMPONENTS = Box(np.array([-1.0, -2.0], np.float32), np.array([1.0, 2.0], np.float32))
 SPACES = [THREE_ACTIONS, TWO_COMPONENTS]

@@ -15,7 +15,7 @@ from recrl.agents.learning.advantages import standardised_rewards
 from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import improve_and_measure
-from recrl.agents.networks.architecture import NetworkForm, orthogonal
+from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 
 STATES = np.array([0, 0, 1, 1, 1, 2])
 ACTIONS = np.array([0, 1, 0, 1, 1, 0])
@@ -29,7 +29,7 @@ def measured(gap: float, limit: float = 5.0) -> Constraints:
 
 def fresh(**options: object) -> tuple[StochasticPolicy, PPOLagrangian, LearningBatch]:
     generator = torch.Generator().manual_seed(0)
-    policy = StochasticPolicy(3, Discrete(2), NetworkForm((8,), orthogonal), 1.0, generator)
+    policy = StochasticPolicy(3, Discrete(2), NetworkArchitecture((8,), orthogonal), 1.0, generator)
     rule = PPOLagrangian(PPOLagConfig.model_validate(options), policy, 1)
     return policy, rule, LearningBatch.deduplicate(np.eye(3, dtype=np.float32)[STATES], ACTIONS, compact=True)
 

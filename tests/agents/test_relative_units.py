@@ -11,7 +11,7 @@ from recrl.agents.constraints.relative_units import RelativeConstraints, Relativ
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
-from recrl.agents.networks.architecture import NetworkForm, orthogonal
+from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.environments.cmdp import Floats
 
 # Spreads of the reward and of two costs: 4, 2 and 0; the third never occurred.
@@ -39,7 +39,7 @@ def test_two_rollouts_by_hand() -> None:
 
 
 def constraints_of(limits: Floats, gaps: Floats) -> RelativeConstraints:
-    policy = StochasticPolicy(1, Discrete(2), NetworkForm((2,), orthogonal), 1.0, torch.Generator())
+    policy = StochasticPolicy(1, Discrete(2), NetworkArchitecture((2,), orthogonal), 1.0, torch.Generator())
     batch = LearningBatch.deduplicate(np.zeros((2, 1), np.float32), np.array([0, 1]), compact=False)
     constraints = Constraints(limits, gaps, np.zeros(3), 10.0)
     return RelativeConstraints.of(Experience.of(policy, batch, ADVANTAGES, constraints), RelativeUnits(3))

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from recrl.agents.learning.critics import Critics
 from recrl.agents.networks import tanh_stack
-from recrl.agents.networks.architecture import INITIALISERS, NetworkForm, orthogonal, xavier
+from recrl.agents.networks.architecture import INITIALISERS, NetworkArchitecture, orthogonal, xavier
 from recrl.agents.networks.flat_parameters import Adam, FlatParameters
 from recrl.agents.networks.tanh_stack import FEW_COLUMNS, TanhStack
 
@@ -70,7 +70,7 @@ def test_both_products_with_the_jacobian_are_automatic_differentiations(num_netw
 
 @pytest.mark.usefixtures("double_precision")
 def test_the_critics_gradient_is_that_of_their_weighted_squared_errors() -> None:
-    critics = Critics(3, 1, NetworkForm((5, 4), xavier), torch.Generator().manual_seed(0))
+    critics = Critics(3, 1, NetworkArchitecture((5, 4), xavier), torch.Generator().manual_seed(0))
     rows = random_rows()
     weights = torch.arange(1.0, 8.0) / 28.0
     targets = torch.randn(2, 7, generator=torch.Generator().manual_seed(1))
@@ -128,7 +128,9 @@ def test_parameters_of_another_network_are_refused() -> None:
 
 @pytest.mark.usefixtures("double_precision")
 def test_many_rows_in_blocks_are_all_rows_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    critics = Critics(3, 1, NetworkForm((FEW_COLUMNS + 2, 4), xavier), torch.Generator().manual_seed(0))
+    critics = Critics(
+        3, 1, NetworkArchitecture((FEW_COLUMNS + 2, 4), xavier), torch.Generator().manual_seed(0)
+    )
     rows, targets = random_rows(23), torch.randn(2, 23, generator=torch.Generator().manual_seed(1))
     weights = torch.full((23,), 1.0 / 23.0)
     found = []

@@ -8,7 +8,7 @@ import torch
 from gymnasium.spaces import Box, Discrete
 
 from recrl.agents.learning.policies import StochasticPolicy
-from recrl.agents.networks.architecture import INITIALISERS, NetworkForm
+from recrl.agents.networks.architecture import INITIALISERS, NetworkArchitecture
 from recrl.agents.networks.module_stack import perceptron
 from recrl.agents.observation_features import Encoder
 from recrl.agents.torch_export import PolicyModule
@@ -36,7 +36,7 @@ def test_a_module_computes_what_the_agent_does(space: Any, own: bool, normalise:
     generator = torch.Generator().manual_seed(0)
     factory = perceptron([8], "relu", INITIALISER)(generator) if own else None
     policy = StochasticPolicy(
-        encoder.size, space, NetworkForm((8, 8), INITIALISER, "tanh", factory), 0.5, generator
+        encoder.size, space, NetworkArchitecture((8, 8), INITIALISER, "tanh", factory), 0.5, generator
     )
     module = PolicyModule(encoder, policy)
     rows = observations()

@@ -9,7 +9,7 @@ from gymnasium.spaces import Box
 
 from recrl.agents.algorithms.own_options import TRPOConfig
 from recrl.agents.learning.policies import StochasticPolicy
-from recrl.agents.networks.architecture import NetworkForm, orthogonal
+from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.agents.networks.flat_parameters import FlatParameters
 from recrl.agents.trust_region.conjugate_gradient import conjugate_gradient
 from recrl.agents.trust_region.line_search import backtrack, line_search
@@ -77,7 +77,7 @@ def test_a_step_is_projected_before_it_is_checked() -> None:
 
 def test_the_line_search_checks_policies_with_their_standard_deviations_at_the_bound() -> None:
     policy = StochasticPolicy(
-        3, Box(-1.0, 1.0, (2,)), NetworkForm((4,), orthogonal), 1.0, torch.Generator(), min_std=0.5
+        3, Box(-1.0, 1.0, (2,)), NetworkArchitecture((4,), orthogonal), 1.0, torch.Generator(), min_std=0.5
     )
     step, checked = torch.zeros_like(policy.parameters.values), []
     step[-2:] = torch.tensor([-9.0, 0.25])

@@ -18,7 +18,7 @@ from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
 from recrl.orchestrator.trial.attempt import run_recorded
 from recrl.teachers.bounds import undiscounted_excess
 
@@ -41,7 +41,7 @@ RIVER = TrialSpec(
 def river_grid(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
     store = SweepStore(tmp_path_factory.mktemp("runs"), "river")
     trial = store.trial(RIVER)
-    assert run_recorded(RIVER, trial, should_stop=lambda: False) is TrialState.COMPLETE
+    assert run_recorded(RIVER, trial, should_stop=lambda: False) is TrialStatus.COMPLETE
     store.write_info({"name": store.name})
     store.write_specs([RIVER])
     return store

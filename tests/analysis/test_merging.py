@@ -18,7 +18,7 @@ from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 from tests.conftest import MadeUpSweep
 from tests.faults.committing import commit_file
 
@@ -73,7 +73,7 @@ def test_the_part_that_got_furthest_is_taken(part: Part) -> None:
     for parts in ([behind, whole], [whole, behind]):
         merged = merge(parts)
         assert_equal(merged, whole)
-        assert all(trial.status is TrialState.COMPLETE for trial in merged.facts)
+        assert all(trial.status is TrialStatus.COMPLETE for trial in merged.facts)
 
 
 def with_options(sweep: Sweep, kind: str, options: Mapping[str, object]) -> Sweep:
@@ -196,16 +196,17 @@ def test_parts_of_other_numbers_of_costs_join(part: Part) -> None:
 def test_a_trial_that_failed_before_its_first_step_is_further_than_one_that_waits(part: Part) -> None:
     failed = part("failed")
     facts = [
-        dataclasses.replace(it, status=TrialState.FAILED, error="no luck", env_steps=0) for it in failed.facts
+        dataclasses.replace(it, status=TrialStatus.FAILED, error="no luck", env_steps=0)
+        for it in failed.facts
     ]
-    waiting = [dataclasses.replace(it, status=TrialState.WAITING, env_steps=0) for it in failed.facts]
+    waiting = [dataclasses.replace(it, status=TrialStatus.WAITING, env_steps=0) for it in failed.facts]
     merged = merge([without_rows(of) for of in (waiting, facts)])
     assert {trial.error for trial in merged.facts} == {"no luck"}
 
 
 def test_figures_need_no_row_of_the_trials_with_most_costs(part: Part, tmp_path: Path) -> None:
     unstarted = part("two", tasks=("b",), num_costs=2)
-    waiting = [dataclasses.replace(it, status=TrialState.WAITING, env_steps=0) for it in unstarted.facts]
+    waiting = [dataclasses.replace(it, status=TrialStatus.WAITING, env_steps=0) for it in unstarted.facts]
     merged = merge([part("one"), without_rows(waiting)])
     assert merged.num_costs == 2
     assert merged.updates["limit_1"].isna().all()

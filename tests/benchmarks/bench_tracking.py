@@ -20,7 +20,7 @@ import numpy as np
 
 from recrl.environments.cmdp import CostLimits, Phase
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
 from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import last_report
@@ -70,7 +70,7 @@ def write_sweep(root: Path, *, trials: int, updates: int) -> SweepStore:
                 }
             )
         writer.commit({}, update=updates, env_steps=updates * STEPS_PER_UPDATE)
-        writer.close(TrialState.COMPLETE)
+        writer.close(TrialStatus.COMPLETE)
     return store
 
 

@@ -35,7 +35,7 @@ from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.learning.critics import Critics
 from recrl.agents.learning.learning_batch import find_repeated
 from recrl.agents.learning.policies import StochasticPolicy
-from recrl.agents.networks.architecture import NetworkForm, xavier
+from recrl.agents.networks.architecture import NetworkArchitecture, xavier
 from recrl.agents.networks.flat_parameters import Adam
 from recrl.agents.registry import AGENTS, agent_config, make_agent
 from recrl.agents.shared_options import ActorCriticConfig, AscentConfig, TrustRegionConfig
@@ -193,7 +193,7 @@ def measure_large(agent_name: str, preset: str, samples: int) -> tuple[float, fl
 def passes_in_turn(samples: int, rounds: int) -> dict[str, list[float]]:
     """Milliseconds of passes over all samples: of two critics, of a policy, and of what bounds them."""
     generator = torch.Generator().manual_seed(0)
-    form = NetworkForm(HIDDEN, xavier)
+    form = NetworkArchitecture(HIDDEN, xavier)
     critics = Critics(NUM_OBSERVATIONS, 1, form, generator)
     actions = Box(-1.0, 1.0, (NUM_ACTIONS,), np.float32)
     policy = StochasticPolicy(NUM_OBSERVATIONS, actions, form, 1.0, generator)

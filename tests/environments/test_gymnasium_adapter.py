@@ -150,6 +150,14 @@ def test_an_environment_that_reports_no_cost_is_refused_unless_told() -> None:
     assert costless.cmdp.horizon == 500
 
 
+def test_gymnasiums_own_mujoco_tasks_can_be_made() -> None:
+    """They import packages that only the extra ``gymnasium[mujoco]`` requires."""
+    environments = make_vector("gymnasium", 2, options={"id": "HalfCheetah-v5", "costless": True})
+    observations, _ = environments.reset(seed=0)
+    assert observations.shape == (2, 17)
+    assert environments.cmdp.horizon == 1000
+
+
 @pytest.mark.parametrize(
     ("attribute", "spec_horizon", "horizon"),
     [

@@ -1,4 +1,4 @@
-"""Maps: the paper's two, what is refused and with which sentence, and what is generated."""
+"""Maps: 1a and 1b, what is refused and with which sentence, and what is generated."""
 
 from __future__ import annotations
 

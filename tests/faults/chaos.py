@@ -41,7 +41,7 @@ import numpy as np
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.tracking.run_content import final_points, points, rows_after, thinned
 
 GRID = """\
@@ -176,7 +176,7 @@ class Chaos:
     def trials(self) -> list[int]:
         """The launch's processes that run a trial."""
         records = (trial.record() for trial in self.store.trials())
-        running = {record.pid for record in records if record.status is TrialState.RUNNING}
+        running = {record.pid for record in records if record.status is TrialStatus.RUNNING}
         return [pid for pid in self.processes("") if pid in running]
 
     def processes(self, name: str) -> list[int]:
@@ -252,7 +252,7 @@ def comm(pid: int) -> str:
 
 def differences(ours: TrialStore, theirs: TrialStore) -> Iterator[str]:
     """What of a trial is not as it is in the undisturbed sweep."""
-    if ours.record().status is not TrialState.COMPLETE:
+    if ours.record().status is not TrialStatus.COMPLETE:
         yield f"it is {ours.record().status}"
         return
     indices = ours.episodes()["index"].tolist()

@@ -42,7 +42,7 @@ import yaml
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 from tests.faults.chaos import compared, shown
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -449,7 +449,7 @@ class Trouble:
     def running_on(self, name: str) -> list[TrialRecord]:
         """The trials that a node runs, as far as their files say, with something to lose."""
         records = (trial.record() for trial in self.store.trials())
-        return [r for r in records if r.status is TrialState.RUNNING and r.host == name and r.update > 0]
+        return [r for r in records if r.status is TrialStatus.RUNNING and r.host == name and r.update > 0]
 
     def kill(self, name: str) -> None:
         """A node loses its power while it runs a trial."""

@@ -24,7 +24,7 @@ from recrl.orchestrator.files.scratch import EMPTY_SECONDS, LOCK, remove_dead, s
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.run_sweep import SweepRunSettings, run_sweep
-from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.trial.attempt import run_recorded
 from recrl.orchestrator.trial.heartbeat import Heartbeat
@@ -100,7 +100,7 @@ def results(store: TrialStore) -> list[bytes]:
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
     store = SweepStore(tmp_path_factory.mktemp("undisturbed"), "sweep").trial(SPEC)
-    assert run_recorded(SPEC, store, should_stop=never) is TrialState.COMPLETE
+    assert run_recorded(SPEC, store, should_stop=never) is TrialStatus.COMPLETE
     return store
 
 
@@ -134,7 +134,7 @@ def fill(folder: Path) -> Path:
 def test_a_trial_on_a_full_disk_waits_and_goes_on_exactly(small_disk: Path, undisturbed: TrialStore) -> None:
     store = SweepStore(small_disk, "sweep").trial(SPEC)
     answers = after(5)
-    assert run_recorded(SPEC, store, should_stop=lambda: next(answers)) is TrialState.WAITING
+    assert run_recorded(SPEC, store, should_stop=lambda: next(answers)) is TrialStatus.WAITING
     committed = store.episodes_path.read_bytes()
     ballast: list[Path] = []
 
@@ -145,9 +145,9 @@ def test_a_trial_on_a_full_disk_waits_and_goes_on_exactly(small_disk: Path, undi
 
     answers = after(3)
     state = run_recorded(SPEC, store, should_stop=lambda: fill_up_after(answers), commit_seconds=0.0)
-    assert state is TrialState.WAITING
+    assert state is TrialStatus.WAITING
     record = store.record()
-    assert record.status is TrialState.WAITING  # the reserve had room for the last words
+    assert record.status is TrialStatus.WAITING  # the reserve had room for the last words
     assert record.error == (
         f"{SPEC.folder_name}: its files cannot be written (No space left on device); it goes on from "
         "update 8 when there is room and the sweep is launched again"
@@ -156,9 +156,9 @@ def test_a_trial_on_a_full_disk_waits_and_goes_on_exactly(small_disk: Path, undi
     assert store.episodes_path.read_bytes().startswith(committed)
 
     fill(small_disk)  # what the reserve gave up as well: not even an attempt can begin
-    assert run_recorded(SPEC, store, should_stop=never) is TrialState.WAITING
+    assert run_recorded(SPEC, store, should_stop=never) is TrialStatus.WAITING
     ballast[0].unlink()
-    assert run_recorded(SPEC, store, should_stop=never) is TrialState.COMPLETE
+    assert run_recorded(SPEC, store, should_stop=never) is TrialStatus.COMPLETE
     assert results(store) == results(undisturbed)
     assert store.record().error == ""
     assert not store.reserve_path.exists()
@@ -184,7 +184,7 @@ def test_what_a_full_disk_keeps_from_being_said_hides_nothing(
         place = SweepPlace(SweepStore(small_disk, "sweep"))
         run_sweep(SweepRunSettings(grid, place, Dying()), stop=threading.Event())
     with pytest.raises(StorageError, match=r"cannot be written \(No space left on device\); it starts anew"):
-        SweepStore(small_disk, "sweep").trial(SPEC).set_status(TrialState.WAITING)
+        SweepStore(small_disk, "sweep").trial(SPEC).set_status(TrialStatus.WAITING)
 
 
 def test_a_limit_on_the_size_of_files_is_a_full_disk(tmp_path: Path, undisturbed: TrialStore) -> None:
@@ -198,12 +198,12 @@ def test_a_limit_on_the_size_of_files_is_a_full_disk(tmp_path: Path, undisturbed
     assert room < checkpoint.stat().st_size
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
     try:
-        assert run_recorded(SPEC, store, should_stop=never, commit_seconds=0.0) is TrialState.WAITING
+        assert run_recorded(SPEC, store, should_stop=never, commit_seconds=0.0) is TrialStatus.WAITING
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert "(File too large); it goes on from update 5 when" in store.record().error
     assert store.checkpoints() == [checkpoint]
-    assert run_recorded(SPEC, store, should_stop=never) is TrialState.COMPLETE
+    assert run_recorded(SPEC, store, should_stop=never) is TrialStatus.COMPLETE
     assert results(store) == results(undisturbed)
 
 
@@ -212,7 +212,7 @@ def test_numbers_that_break_down_are_located(tmp_path: Path, monkeypatch: pytest
     monkeypatch.syspath_prepend(tmp_path)
     spec = replace(SPEC, task=Choice("my_poisoned_task:TASK", {"horizon": 10}))
     store = SweepStore(tmp_path, "sweep").trial(spec)
-    assert run_recorded(spec, store, should_stop=never, commit_seconds=0.0) is TrialState.FAILED
+    assert run_recorded(spec, store, should_stop=never, commit_seconds=0.0) is TrialStatus.FAILED
     record = store.record()
     assert record.error == (
         "TaskOutputError: the task my_poisoned_task:TASK returned a reward of nan at step 1 of the rollout "
@@ -244,7 +244,7 @@ def test_a_trial_that_takes_long_to_begin_is_heard_meanwhile(
     (tmp_path / "my_slow_task.py").write_text(SLOW_TASK.format(state=str(store.state_path)))
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr("recrl.orchestrator.trial.attempt.HEARTBEAT_SECONDS", 0.01)
-    assert run_recorded(spec, store, should_stop=lambda: True) is TrialState.WAITING
+    assert run_recorded(spec, store, should_stop=lambda: True) is TrialStatus.WAITING
     assert sys.modules["my_slow_task"].heard
 
 

@@ -29,7 +29,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.find_sweep import find_sweep
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.trial import speed
 from recrl.orchestrator.trial.saved_policy import SavedTrial
 from recrl.orchestrator.trial.speed import measured_speed
@@ -451,7 +451,7 @@ def test_logs_of_nobody_and_of_several(
     grid = parse_grid(GRID.encode(), source="grid.yaml")
     store = SweepStore(folder / "runs", "small")
     for spec in grid.trials():
-        store.trial(spec).begin(spec).close(TrialState.WAITING)
+        store.trial(spec).begin(spec).close(TrialStatus.WAITING)
     store.write_info({"name": store.name})
     assert main(["logs", "small", *words]) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err.startswith(f"recrl-sweep: {sentence}")
@@ -461,7 +461,7 @@ def test_status_says_why_a_trial_was_stopped(folder: Path, capsys: pytest.Captur
     grid = parse_grid(GRID.encode(), source="grid.yaml")
     store = SweepStore(folder / "runs", "small")
     spec = grid.trials()[0]
-    store.trial(spec).begin(spec).close(TrialState.WAITING, error="the disk was full")
+    store.trial(spec).begin(spec).close(TrialStatus.WAITING, error="the disk was full")
     store.write_info({"name": store.name})
     assert main(["status", "--brief"]) == ExitCode.OK  # nothing was launched: no trials are known
     store.write_specs([spec])
@@ -787,7 +787,7 @@ def _log_of_a_trial_that_begins_later(
         writer = store.trial(spec).begin(spec)
         store.trial(spec).log_path.write_text("it began\n")
         yield from [None] * 3
-        writer.close(TrialState.WAITING)
+        writer.close(TrialStatus.WAITING)
         yield
 
     pauses = happens()
@@ -816,7 +816,7 @@ def test_following_the_log_of_a_stopped_trial_waits_until_it_runs_again(
     grid = parse_grid(GRID.encode(), source="grid.yaml")
     store = SweepStore(folder / "runs", "small")
     spec = grid.trials()[0]
-    store.trial(spec).begin(spec).close(TrialState.WAITING)
+    store.trial(spec).begin(spec).close(TrialStatus.WAITING)
     _log_of_a_trial_that_begins_later(monkeypatch, store, grid, spec.trial_id)
     assert "it began\n" in capsys.readouterr().out
 

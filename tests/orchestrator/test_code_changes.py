@@ -25,14 +25,16 @@ from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.launch_plan import PlannedAction, TrialSelection, make_plan
 from recrl.orchestrator.provenance import code_changes
 from recrl.orchestrator.provenance.code_changes import (
+    CodeComparison,
     code_of,
-    has_other_code,
-    other_code,
+    compare,
+    compare_files,
+    missing_modules_sentence,
     other_code_sentence,
 )
 from recrl.orchestrator.ray.tune_callbacks import DriverWatch
 from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_sweep
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.sweep_progress import DisplayStatus, progress
 from tests.orchestrator.launches import INLINE
@@ -93,7 +95,7 @@ def test_a_changed_task_is_said_everywhere_and_run_again_when_asked(
     assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
     store = SweepStore(folder / "runs", "small")
     trial = store.trials()[0]
-    assert not has_other_code(trial, trial.spec)
+    assert not compare_files(trial, trial.spec).differs
     before = trial.episodes_path.read_bytes()
     change(folder)
     capsys.readouterr()
@@ -253,7 +255,7 @@ def test_a_rerun_that_is_killed_while_it_moves_old_files_goes_on(
     (planned,) = make_plan(grid.trials(), store).trials
     assert planned.action is PlannedAction.RERUN
     run_sweep(SweepRunSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
-    assert trial.record().status is TrialState.COMPLETE
+    assert trial.record().status is TrialStatus.COMPLETE
     assert trial.record().attempt == 1
     assert not trial.damages()
     assert not trial.rerun_path.exists()
@@ -273,11 +275,11 @@ def test_a_failed_trial_of_other_code_is_run_again_too(folder: Path) -> None:
     store, grid = SweepStore(folder / "runs", "small"), read_grid(folder / "grid.yaml", build=False)
     run_sweep(SweepRunSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
     (spec,) = grid.trials()
-    assert store.trial(spec).record().status is TrialState.FAILED
+    assert store.trial(spec).record().status is TrialStatus.FAILED
     change(folder)
     result = _rerun(grid, store, InlineExecutor())
     assert not result.plan.other_code
-    assert store.trial(spec).record().status is TrialState.COMPLETE
+    assert store.trial(spec).record().status is TrialStatus.COMPLETE
     assert not store.trial(spec).error_path.exists()
 
 
@@ -302,7 +304,7 @@ def test_every_attempt_keeps_where_it_comes_from(folder: Path) -> None:
     assert first["recrl"] == code_of(spec)["recrl"]
     assert first["my_scaled_task"] != code_of(spec)["my_scaled_task"]
     assert all({"recrl", "python", "packages", "source"} <= set(attempt) for attempt in attempts)
-    assert has_other_code(store.trial(spec), spec)  # its first attempt ran other code
+    assert compare_files(store.trial(spec), spec).differs  # its first attempt ran other code
 
 
 def test_a_plan_reads_the_users_code_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -342,9 +344,9 @@ def test_modules_that_a_plug_in_imports_are_among_its_code(folder: Path) -> None
     (folder / "my_units" / "lengths.py").write_text("METRE = 2\n")
     after = code_of(spec)
     assert {name for name in before if before[name] != after[name]} == {"my_units"}
-    assert other_code([{"code": before}], spec)
+    assert compare([{"code": before}], spec).differs
     old = {name: before[name] for name in ("recrl", "my_scaled_task")}  # what earlier versions wrote
-    assert not other_code([{"code": old}], spec)
+    assert not compare([{"code": old}], spec).differs
     assert not {"my_physics", "my_units"} & set(sys.modules)
 
 
@@ -363,14 +365,44 @@ def test_the_imports_of_a_plug_in_are_followed_within_its_project_and_bounds(
     assert list(code_of(spec)) == ["recrl", "my_scaled_task", "my_a"]
 
 
-def test_of_a_package_that_is_not_here_nothing_is_said(folder: Path) -> None:
+def test_of_a_package_that_is_not_here_it_is_said_that_it_was_not_compared(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
-    trial = SweepStore(folder / "runs", "small").trials()[0]
+    store = SweepStore(folder / "runs", "small")
+    trial = store.trials()[0]
     (folder / "my_scaled_task.py").unlink()
     importlib.invalidate_caches()
     sys.modules.pop("my_scaled_task", None)
     assert set(code_of(trial.spec)) == {"recrl"}
-    assert not has_other_code(trial, trial.spec)
+    assert compare_files(trial, trial.spec) == CodeComparison(missing=frozenset({"my_scaled_task"}))
+    sentence = (
+        "the code of 1 trial was not checked for changes, because the module my_scaled_task was not found; "
+        "start the command in the folder that holds it"
+    )
+    capsys.readouterr()
+    for command in (["status", "--brief"], ["figures"]):
+        assert main(command) == ExitCode.OK
+        assert f"warning: {sentence}" in capsys.readouterr().out.splitlines()
+    assert sentence in drawing.missing(sweep_data.load(store))
+
+
+def test_a_changed_module_of_the_working_directory_is_found_without_trust(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A command that may not import the module is not told of its folder by Python."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / "my_scaled_task.py").write_text(TASK)
+    (tmp_path / "grid.yaml").write_text(GRID.replace("SEEDS", "0"))
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    change(tmp_path)
+    assert str(tmp_path) not in sys.path
+    capsys.readouterr()
+    for command in (["status", "--brief"], ["figures"]):
+        assert main(command) == ExitCode.OK
+        assert SENTENCE in capsys.readouterr().out.splitlines()
+    assert "my_scaled_task" not in sys.modules
 
 
 def test_the_sentences_count() -> None:
@@ -381,6 +413,10 @@ def test_the_sentences_count() -> None:
     )
     assert other_code_sentence(1, 2).startswith("1 complete trial and 2 begun ones come from other code than")
     assert other_code_sentence(0, 1).startswith("1 begun trial comes from other code than")
+    assert missing_modules_sentence([(), ()]) == ""
+    assert missing_modules_sentence([{"b", "c"}, (), {"a", "b"}]).startswith(
+        "the code of 2 trials was not checked for changes, because the module a and 2 others were not found; "
+    )
     assert no_curriculum_sentence([]) == ""
     assert no_curriculum_sentence([f"t{i}" for i in range(7)]) == (
         "the measured d_t is not above d_d, so that the curriculum is none: t0, t1, t2, t3, t4 and 2 more; "

@@ -10,6 +10,7 @@ import jsonschema
 import numpy as np
 import pytest
 import yaml
+from pydantic import BaseModel
 
 from recrl.agents.registry import AGENTS
 from recrl.environments.plugins import modules_in
@@ -18,6 +19,15 @@ from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.cli.requests import TEMPLATES
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid.checking import read_grid
+from recrl.orchestrator.grid.file_models import (
+    Entry,
+    Exclusion,
+    GridFile,
+    Limits,
+    Resources,
+    Run,
+    TaskEntry,
+)
 from recrl.orchestrator.grid.json_schema import grid_schema
 from recrl.teachers.registry import TEACHERS
 
@@ -119,8 +129,19 @@ def test_options_of_a_grids_sections_are_shown(capsys: pytest.CaptureFixture[str
     assert re.search(r"^total_steps +whole number +required +Environment steps", out, re.MULTILINE)
     assert "silence_seconds" in output(capsys, "options", "resources")
     out = output(capsys, "options", "limits")
-    assert re.search(r"^train_limits +'auto' or number or list of number or null ", out, re.MULTILINE)
-    assert re.search(r"^deploy_limits +number or list of number or null ", out, re.MULTILINE)
+    auto, number = "'auto' or number or list of number or null", "number or list of number or null"
+    assert re.search(rf'^train_limits +{auto} +"auto" +Training limits', out, re.MULTILINE)
+    assert re.search(rf"^deploy_limits +{number} +required +Deployment limits", out, re.MULTILINE)
+
+
+@pytest.mark.parametrize("model", [GridFile, TaskEntry, Entry, Run, Resources, Exclusion])
+def test_every_key_of_a_grid_is_described(model: type[BaseModel]) -> None:
+    for name, field in model.model_fields.items():
+        assert (field.description or "").endswith("."), name
+
+
+def test_the_editors_schema_does_not_demand_limits_that_may_stand_elsewhere() -> None:
+    assert Limits.model_json_schema().get("required", []) == []
 
 
 def test_the_next_command_finds_a_task_of_ones_own_in_another_folder(

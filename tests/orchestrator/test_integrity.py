@@ -23,7 +23,7 @@ from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.launch_plan import PlannedAction, make_plan
 from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_sweep
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.trial.attempt import run_recorded
 from tests.orchestrator.launches import INLINE
@@ -126,7 +126,11 @@ def test_a_complete_trial_that_was_cut_is_damaged_and_its_numbers_are_not_used(
     after, before = cut(trial.episodes_path)
     sentence = f"episodes.csv has {after:,} of its {before:,} committed bytes; {RERUN}"
     record = trial.record()
-    assert (record.status, record.claims, record.error) == (TrialState.DAMAGED, TrialState.COMPLETE, sentence)
+    assert (record.status, record.claims, record.error) == (
+        TrialStatus.DAMAGED,
+        TrialStatus.COMPLETE,
+        sentence,
+    )
     sweep = sweep_data.load(store)
     assert sweep.trials["status"].tolist() == ["complete", "damaged"]
     assert set(sweep.phases["method"]) == set(sweep.updates["method"]) == {"none"}
@@ -204,7 +208,7 @@ def test_an_interrupted_trial_goes_on_from_what_is_whole_and_nothing_is_filled_w
     trial = store.trial(SPECS[1])
     do(trial.folder / name)
     if do is not flip:
-        assert trial.record().status is TrialState.DAMAGED
+        assert trial.record().status is TrialStatus.DAMAGED
         assert trial.record().error.endswith(GOES_ON)
         assert [it.action for it in make_plan(SPECS, store).trials] == [
             PlannedAction.RESUME,
@@ -225,7 +229,7 @@ def test_what_is_cut_behind_the_checkpoint_before_is_taken_up_there(stopped: Swe
     tree = writer.restore()
     assert tree is not None and tree["update"] == 3
     assert newest.with_suffix(".damaged").exists() and before.exists()
-    assert trial.record().status is TrialState.RUNNING
+    assert trial.record().status is TrialStatus.RUNNING
     assert len(trial.episodes()) == 3 * 4
 
 
@@ -532,7 +536,7 @@ def test_an_agent_whose_metrics_change_is_named_and_one_that_reorders_them_is_no
     trial = SweepStore(tmp_path, "sweep").trial(spec)
     run_recorded(spec, trial, should_stop=lambda: False)
     assert trial.record().error.startswith(error)
-    assert trial.record().status is (TrialState.FAILED if error else TrialState.COMPLETE)
+    assert trial.record().status is (TrialStatus.FAILED if error else TrialStatus.COMPLETE)
     if not error:
         plain = SweepStore(tmp_path, "plain").trial(SPECS[0])
         run_recorded(SPECS[0], plain, should_stop=lambda: False)

@@ -19,7 +19,7 @@ from recrl.orchestrator.launch_plan import (
     unmeasured,
     usable_cores,
 )
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 
 GRID = b"""\
 name: plan
@@ -37,7 +37,7 @@ def store(tmp_path: Path) -> SweepStore:
     return SweepStore(tmp_path, "plan")
 
 
-def _begin(store: SweepStore, spec: TrialSpec, *, env_steps: int, end: TrialState | None = None) -> None:
+def _begin(store: SweepStore, spec: TrialSpec, *, env_steps: int, end: TrialStatus | None = None) -> None:
     """Leave a trial that has taken some steps, in the given state or running."""
     writer = store.trial(spec).begin(spec)
     writer.commit({}, update=1, env_steps=env_steps)
@@ -54,10 +54,10 @@ def test_nothing_on_disk_is_all_new(store: SweepStore) -> None:
 
 
 def test_each_trial_gets_the_work_its_files_ask_for(store: SweepStore) -> None:
-    _begin(store, SPECS[0], env_steps=1000, end=TrialState.COMPLETE)
-    _begin(store, SPECS[1], env_steps=400, end=TrialState.WAITING)
+    _begin(store, SPECS[0], env_steps=1000, end=TrialStatus.COMPLETE)
+    _begin(store, SPECS[1], env_steps=400, end=TrialStatus.WAITING)
     _begin(store, SPECS[2], env_steps=300)
-    _begin(store, SPECS[3], env_steps=200, end=TrialState.FAILED)
+    _begin(store, SPECS[3], env_steps=200, end=TrialStatus.FAILED)
     plan = make_plan(SPECS[:5], store)
     actions = [trial.action for trial in plan.trials]
     assert actions == [
@@ -72,7 +72,7 @@ def test_each_trial_gets_the_work_its_files_ask_for(store: SweepStore) -> None:
 
 
 def test_failed_trials_are_tried_again_only_when_asked(store: SweepStore) -> None:
-    _begin(store, SPECS[0], env_steps=200, end=TrialState.FAILED)
+    _begin(store, SPECS[0], env_steps=200, end=TrialStatus.FAILED)
     assert make_plan(SPECS[:1], store).to_do == ()
     assert (
         make_plan(SPECS[:1], store, TrialSelection(retry_failed=True)).trials[0].action is PlannedAction.RETRY
@@ -80,14 +80,14 @@ def test_failed_trials_are_tried_again_only_when_asked(store: SweepStore) -> Non
 
 
 def test_trials_that_left_the_grid_are_listed_and_kept(store: SweepStore) -> None:
-    _begin(store, SPECS[0], env_steps=1000, end=TrialState.COMPLETE)
+    _begin(store, SPECS[0], env_steps=1000, end=TrialStatus.COMPLETE)
     plan = make_plan(SPECS[1:], store)
     assert [orphan.spec for orphan in plan.orphans] == [SPECS[0]]
-    assert store.trial(SPECS[0]).record().status is TrialState.COMPLETE
+    assert store.trial(SPECS[0]).record().status is TrialStatus.COMPLETE
 
 
 def test_a_selection_makes_no_orphans(store: SweepStore) -> None:
-    _begin(store, SPECS[0], env_steps=1000, end=TrialState.COMPLETE)
+    _begin(store, SPECS[0], env_steps=1000, end=TrialStatus.COMPLETE)
     plan = make_plan(SPECS, store, TrialSelection(only={"seed": ["1"]}))
     assert {spec.seed for spec in plan.to_do} == {1}
     assert plan.orphans == ()
@@ -102,7 +102,7 @@ def test_the_time_is_unknown_before_a_trial_of_the_kind_has_run(store: SweepStor
 
 def test_the_time_follows_from_the_speed_of_the_same_task_and_agent(store: SweepStore) -> None:
     for spec in (SPECS[0], SPECS[2]):  # one of each agent
-        _begin(store, spec, env_steps=1000, end=TrialState.COMPLETE)
+        _begin(store, spec, env_steps=1000, end=TrialStatus.COMPLETE)
     plan = make_plan(SPECS, store)
     seconds = {
         trial.spec.agent.label: trial.record.cpu_seconds for trial in plan.trials if trial.record.update
@@ -113,7 +113,7 @@ def test_the_time_follows_from_the_speed_of_the_same_task_and_agent(store: Sweep
 
 
 def test_a_trial_that_has_taken_no_step_tells_no_speed(store: SweepStore) -> None:
-    _begin(store, SPECS[0], env_steps=0, end=TrialState.WAITING)
+    _begin(store, SPECS[0], env_steps=0, end=TrialStatus.WAITING)
     plan = make_plan(SPECS[:2], store)
     assert plan.trials[0].record.cpu_seconds > 0.0
     assert estimate(plan, concurrent=1).unknown == ("two-state ppo-lag",)
@@ -121,7 +121,7 @@ def test_a_trial_that_has_taken_no_step_tells_no_speed(store: SweepStore) -> Non
 
 
 def test_nothing_to_do_takes_nothing(store: SweepStore) -> None:
-    _begin(store, SPECS[0], env_steps=1000, end=TrialState.COMPLETE)
+    _begin(store, SPECS[0], env_steps=1000, end=TrialStatus.COMPLETE)
     found = estimate(make_plan(SPECS[:1], store), concurrent=2)
     assert (found.wall_seconds, found.concurrent, found.gigabytes) == (0.0, 0, 0.0)
 

@@ -39,7 +39,7 @@ from recrl.orchestrator.ray.ray_executor import (
 from recrl.orchestrator.ray.teacher_service import RayTeacher, start_teacher_service
 from recrl.orchestrator.ray.tune_callbacks import LONGEST_PAUSE_SECONDS, pause_seconds
 from recrl.orchestrator.remote.remote_sweep import RemoteSweep
-from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, Teacher, TeacherSpec
@@ -83,7 +83,7 @@ def inline(tmp_path_factory: pytest.TempPathFactory) -> SweepStore:
 def assert_equal_bytes(specs: Sequence[TrialSpec], store: SweepStore, expected: SweepStore) -> None:
     for spec in specs:
         ours, theirs = store.trial(spec), expected.trial(spec)
-        assert ours.record().status is TrialState.COMPLETE
+        assert ours.record().status is TrialStatus.COMPLETE
         assert ours.episodes_path.read_bytes() == theirs.episodes_path.read_bytes()
         assert ours.events_path.read_bytes() == theirs.events_path.read_bytes()
         assert ours.evaluation_path.read_bytes() == theirs.evaluation_path.read_bytes()
@@ -113,11 +113,11 @@ def test_equal_bytes_in_reused_workers_and_failures_stop_nobody(
     assert_equal_bytes(SWEEP, store, inline)
     assert len({store.trial(spec).record().pid for spec in SWEEP}) <= 2
     failed = store.trial(BROKEN).record()
-    assert failed.status is TrialState.FAILED
+    assert failed.status is TrialStatus.FAILED
     assert failed.attempt == 1
     assert failed.error.startswith("ValidationError: ")
     crashed = store.trial(CRASHING).record()
-    assert crashed.status is TrialState.FAILED
+    assert crashed.status is TrialStatus.FAILED
     assert crashed.error == (
         "its process failed once; the last time: it ended without an error: killed from outside, "
         "out of memory, or ended by the task's or the agent's own code"
@@ -142,7 +142,7 @@ def test_a_stopped_sweep_is_finished_by_the_next_run_with_other_workers(
         RayExecutor().run((LONG, *SWEEP), SweepPlace(store), stop)
     assert time.monotonic() - stopped_at[0] < 20.0
     record = store.trial(LONG).record()
-    assert record.status is TrialState.WAITING
+    assert record.status is TrialStatus.WAITING
     assert 20 <= record.update < LONG.num_updates
     left = [spec for spec in (*reversed(SWEEP), LONG) if not store.trial(spec).record().status.is_finished]
     RayExecutor(resources=Resources(max_concurrent=1, teacher="inline")).run(
@@ -185,7 +185,7 @@ def test_trials_in_an_object_store_outlive_their_workers_and_their_folders(
 
     def is_halfway() -> bool:
         record = copy.trial(LONG).record()
-        return record.status is TrialState.RUNNING and bool(record.committed.get("updates.csv"))
+        return record.status is TrialStatus.RUNNING and bool(record.committed.get("updates.csv"))
 
     with place.kept_up_to_date(never, every=0.1), once(is_halfway, kill):
         RayExecutor(commit_seconds=0.2).run([LONG], place, never)

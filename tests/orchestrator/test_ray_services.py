@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 from tests.faults.chaos import comm, descendants
 
 GRID = """\
@@ -43,7 +43,7 @@ def running_trial(store: SweepStore) -> int:
     while time.monotonic() < end:
         for trial in store.trials():
             record = trial.record()
-            if record.status is TrialState.RUNNING and record.update:
+            if record.status is TrialStatus.RUNNING and record.update:
                 return record.pid
     raise AssertionError("no trial began within two minutes")
 
@@ -77,7 +77,7 @@ def test_a_dead_service_of_ray_ends_the_launch_with_a_sentence_and_leaves_no_pro
     again = launch(tmp_path)
     _, errors = again.communicate(timeout=300.0)
     assert again.returncode == 0, errors
-    assert [trial.record().status for trial in store.trials()] == [TrialState.COMPLETE]
+    assert [trial.record().status for trial in store.trials()] == [TrialStatus.COMPLETE]
 
 
 def test_what_a_killed_launch_left_of_ray_is_ended_by_the_next_one(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_sweep import RemoteSweep
 from recrl.orchestrator.remote.stop_object import StopObject
 from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_sweep
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.trial.attempt import run_recorded
 from tests.faults.unreliable import Unreliable
@@ -108,7 +108,7 @@ def assert_equal(ours: SweepStore, theirs: SweepStore) -> None:
 
 
 def assert_equal_trial(ours: TrialStore, theirs: TrialStore) -> None:
-    assert ours.record().status is TrialState.COMPLETE
+    assert ours.record().status is TrialStatus.COMPLETE
     assert ours.episodes_path.read_bytes() == theirs.episodes_path.read_bytes()
     assert ours.evaluation_path.read_bytes() == theirs.evaluation_path.read_bytes()
     assert ours.events_path.read_bytes() == theirs.events_path.read_bytes()
@@ -233,7 +233,7 @@ def test_a_trial_killed_on_one_machine_goes_on_on_another(tmp_path: Path, local:
         seen.storage.pull(checkpoints=True)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
-    assert seen.store.trial(spec).record().status is TrialState.RUNNING  # it had no time to say otherwise
+    assert seen.store.trial(spec).record().status is TrialStatus.RUNNING  # it had no time to say otherwise
     second = machine(tmp_path, "second")
     second.launch()
     assert second.store.trial(spec).record().attempt == 2
@@ -269,7 +269,7 @@ def test_a_storage_that_stays_down_is_given_up_and_the_trial_goes_on_later(
         run_recorded(spec, trial, should_stop=never)
     Unreliable.plan.clear()
     here.storage.pull()
-    assert here.store.trial(spec).record().status is not TrialState.COMPLETE
+    assert here.store.trial(spec).record().status is not TrialStatus.COMPLETE
     here.launch()
     assert_equal(here.store, local)
 
@@ -363,7 +363,7 @@ def test_a_trial_whose_commits_are_damaged_is_left_alone_and_the_others_go_on(
     assert "no commit of the trial is intact, so it is left alone" in caplog.text
     result = fresh.launch()
     assert result.plan.to_do == (other,)
-    assert fresh.store.trial(damaged).record().status is TrialState.DAMAGED
+    assert fresh.store.trial(damaged).record().status is TrialStatus.DAMAGED
     assert_equal_trial(fresh.store.trial(other), local.trial(other))
     (tmp_path / "grid.yaml").write_text(GRID)
     arguments = [str(tmp_path / "grid.yaml"), *INLINE, "--root", str(tmp_path / "fresh")]
@@ -408,13 +408,13 @@ def test_what_only_the_launch_knows_of_a_trial_is_seen_elsewhere(tmp_path: Path)
         with here.storage.working_copy(spec, never) as trial:
             trial.begin(spec)
     here.storage.pull()
-    here.store.trial(crashed).set_status(TrialState.FAILED, error="failures of its process: 4")
-    here.store.trial(silent).set_status(TrialState.WAITING)
+    here.store.trial(crashed).set_status(TrialStatus.FAILED, error="failures of its process: 4")
+    here.store.trial(silent).set_status(TrialStatus.WAITING)
     here.storage.send_dead_trials([crashed, silent])
     there.storage.pull()
     record = there.store.trial(crashed).record()
-    assert (record.status, record.error) == (TrialState.FAILED, "failures of its process: 4")
-    assert there.store.trial(silent).record().status is TrialState.WAITING
+    assert (record.status, record.error) == (TrialStatus.FAILED, "failures of its process: 4")
+    assert there.store.trial(silent).record().status is TrialStatus.WAITING
 
 
 def test_damage_in_a_local_copy_is_not_sent_with_the_status_of_a_dead_trial(
@@ -433,12 +433,12 @@ def test_damage_in_a_local_copy_is_not_sent_with_the_status_of_a_dead_trial(
     for path in (copy.updates_path, *copy.checkpoints()):
         data = path.read_bytes()
         path.write_bytes(data[:-2] + bytes([data[-2] ^ 1]) + data[-1:])
-    copy.set_status(TrialState.FAILED, error="its process died")
+    copy.set_status(TrialStatus.FAILED, error="its process died")
     here.storage.send_dead_trials([spec])
     there.storage.mark()
     there.storage.pull()
     seen = there.store.trial(spec)
-    assert (seen.record().status, seen.record().error) == (TrialState.FAILED, "its process died")
+    assert (seen.record().status, seen.record().error) == (TrialStatus.FAILED, "its process died")
     assert seen.damages() == []
     assert seen.updates_path.read_bytes() == whole
     there.launch(retry_failed=True)
@@ -454,7 +454,7 @@ def test_a_launch_that_was_taken_over_leaves_the_trials_of_the_other_alone(tmp_p
         trial.begin(spec)
         upload.push()
         here.storage.pull()
-        here.store.trial(spec).set_status(TrialState.WAITING)
+        here.store.trial(spec).set_status(TrialStatus.WAITING)
         here.storage.send_dead_trials([spec])
         upload.push()
     here.storage.send_dead_trials([spec])

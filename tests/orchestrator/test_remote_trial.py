@@ -32,7 +32,7 @@ from recrl.orchestrator.remote.commit_format import PREFIX_BYTES, Commit, pack, 
 from recrl.orchestrator.remote.commit_upload import Upload, working_copy
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_trial import RemoteTrial
-from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
 from recrl.orchestrator.trial.attempt import run_recorded
 from tests.faults.unreliable import Unreliable
 
@@ -129,7 +129,7 @@ def test_a_trial_goes_on_elsewhere_with_what_was_sent_last(remote: RemoteTrial, 
     assert second.trial.record().attempt == 2
     second.work(3)
     second.work(4)
-    second.writer.close(TrialState.COMPLETE)
+    second.writer.close(TrialStatus.COMPLETE)
     second.upload.finish()
     there = local_copy(remote, tmp_path / "copy")
     assert updates(there) == [1, 2, 3, 4]
@@ -142,7 +142,7 @@ def test_every_file_of_a_trial_has_a_kind_and_is_sent(tmp_path: Path) -> None:
     spec = replace(SPEC, rollout_steps=50, evaluation_episodes=2)
     remote = RemoteTrial(ObjectStore(f"file://{tmp_path}/bucket"), spec.folder_name)
     with working_copy(remote, spec, lambda: False) as trial:
-        assert run_recorded(spec, trial, should_stop=lambda: False) is TrialState.COMPLETE
+        assert run_recorded(spec, trial, should_stop=lambda: False) is TrialStatus.COMPLETE
         trial.error_path.write_text("of an attempt that failed")
         written = {path.name: path.read_bytes() for path in trial.folder.iterdir() if path.is_file()}
     sent = files_of(FileKind.ROWS, FileKind.LOG, FileKind.WHOLE)
@@ -221,7 +221,7 @@ def test_a_local_copy_leaves_checkpoints_of_running_trials_where_they_are(
     assert local_copy(bucket, tmp_path / "copy", checkpoints=False).checkpoints() == []
     assert len(local_copy(bucket, tmp_path / "copy", checkpoints=True).checkpoints()) == 1
     machine.work(2)
-    machine.writer.close(TrialState.COMPLETE)
+    machine.writer.close(TrialStatus.COMPLETE)
     machine.upload.finish()
     there = local_copy(bucket, tmp_path / "copy", checkpoints=False)
     assert [path.name for path in there.checkpoints()] == ["checkpoint-00000002.recrl"]
@@ -258,9 +258,9 @@ def test_signs_of_life_say_how_far_a_trial_is_and_commit_nothing(bucket: RemoteT
     there = local_copy(bucket, tmp_path / "copy")
     assert (there.record().update, there.record().env_steps) == (7, 70)
     assert updates(there) == [1]
-    machine.writer.close(TrialState.WAITING)
+    machine.writer.close(TrialStatus.WAITING)
     machine.upload.finish()
-    assert local_copy(bucket, tmp_path / "copy").record().status is TrialState.WAITING
+    assert local_copy(bucket, tmp_path / "copy").record().status is TrialStatus.WAITING
 
 
 def test_what_a_dead_node_writes_late_is_not_read(bucket: RemoteTrial, tmp_path: Path) -> None:
@@ -307,13 +307,13 @@ def test_a_sign_of_life_of_an_attempt_before_the_commits_is_passed_over(
     [alive] = [key for key in keys if key.endswith("/alive.json")]
     sign = bucket.objects.read(alive)
     second = Machine(bucket, tmp_path / "second")
-    second.writer.close(TrialState.COMPLETE)
+    second.writer.close(TrialStatus.COMPLETE)
     second.upload.finish()
     assert sign is not None
     bucket.objects.write(alive, sign)
     trial = TrialStore(tmp_path / "copy" / SPEC.folder_name)
     bucket.download(trial, keys, checkpoints=True)
-    assert (trial.record().attempt, trial.record().status) == (2, TrialState.COMPLETE)
+    assert (trial.record().attempt, trial.record().status) == (2, TrialStatus.COMPLETE)
 
 
 def test_of_two_attempts_at_once_all_agree_on_one(bucket: RemoteTrial, tmp_path: Path) -> None:
@@ -417,7 +417,7 @@ def test_a_trial_without_a_commit_that_can_be_used_is_damaged_and_left_alone(
         pass
     sweep = SweepStore(tmp_path, "copy")
     there = local_copy(bucket, sweep.trials_folder)
-    assert there.record().status is TrialState.DAMAGED
+    assert there.record().status is TrialStatus.DAMAGED
     assert there.record().error == f"{bucket.objects.uri}/{newest}: {sentence}"
     assert there.damages() == [there.record().error]
     assert make_plan([SPEC], sweep).to_do == ()
@@ -425,7 +425,7 @@ def test_a_trial_without_a_commit_that_can_be_used_is_damaged_and_left_alone(
     for key, data in whole.items():
         bucket.objects.write(key, data)
     assert updates(local_copy(bucket, sweep.trials_folder)) == [1, 2]
-    assert there.record().status is TrialState.RUNNING
+    assert there.record().status is TrialStatus.RUNNING
 
 
 def test_a_commit_that_is_listed_but_not_found_is_waited_for(
@@ -531,11 +531,11 @@ def test_a_verdict_from_outside_stands_until_the_trial_speaks(bucket: RemoteTria
     machine.work(1)
     machine.upload.follow()
     there = local_copy(bucket, tmp_path / "copy")
-    there.set_status(TrialState.FAILED, error="its process died")
-    assert local_copy(bucket, tmp_path / "copy").record().status is TrialState.FAILED
+    there.set_status(TrialStatus.FAILED, error="its process died")
+    assert local_copy(bucket, tmp_path / "copy").record().status is TrialStatus.FAILED
     successor = Machine(bucket, tmp_path / "successor")
     successor.upload.follow()
-    assert local_copy(bucket, tmp_path / "copy").record().status is TrialState.RUNNING
+    assert local_copy(bucket, tmp_path / "copy").record().status is TrialStatus.RUNNING
 
 
 def test_an_upload_that_failed_is_made_good_by_the_next(bucket: RemoteTrial, tmp_path: Path) -> None:
@@ -563,9 +563,9 @@ def test_a_commit_whose_answer_was_lost_is_not_taken_for_the_next(
     with pytest.raises(StorageError):
         machine.upload.push()
     assert updates(local_copy(bucket, tmp_path / "copy")) == [1]
-    machine.writer.close(TrialState.COMPLETE)
+    machine.writer.close(TrialStatus.COMPLETE)
     machine.upload.finish()
-    assert local_copy(bucket, tmp_path / "copy").record().status is TrialState.COMPLETE
+    assert local_copy(bucket, tmp_path / "copy").record().status is TrialStatus.COMPLETE
     commits = [key for key in bucket.objects.keys_in() if "/commit-" in key]
     assert [key.rpartition("/")[2] for key in commits] == ["commit-00000002"]
 
@@ -597,10 +597,10 @@ def test_whatever_fails_readers_see_one_commit_and_the_end_is_complete(
             Unreliable.plan.append(step)
         elif step == "end":
             Unreliable.plan.clear()
-            machine.writer.close(TrialState.COMPLETE)
+            machine.writer.close(TrialStatus.COMPLETE)
             machine.upload.finish()
             assert updates(local_copy(remote, folder / "copy")) == list(range(1, update + 1))
-            assert local_copy(remote, folder / "copy").record().status is TrialState.COMPLETE
+            assert local_copy(remote, folder / "copy").record().status is TrialStatus.COMPLETE
         else:
             try:
                 machine.upload.push()

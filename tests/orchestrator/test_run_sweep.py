@@ -22,7 +22,7 @@ from recrl.orchestrator.run_sweep import (
     run_sweep,
     stopping_on_signals,
 )
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.sweep_progress import SweepProgress
 
@@ -169,8 +169,8 @@ def test_one_trial_that_fails_leaves_the_others_alone(
     assert record.error.startswith("ArithmeticError: the policy is no longer finite (in update 1")
     assert "Traceback" in files.error_path.read_text()
     assert [trial.record.status for trial in result.progress.trials] == [
-        TrialState.FAILED,
-        TrialState.COMPLETE,
+        TrialStatus.FAILED,
+        TrialStatus.COMPLETE,
     ]
     (tmp_path / "broken").unlink()
     assert _launch(store, grid).plan.to_do == ()  # not tried again by itself
@@ -234,7 +234,7 @@ def test_the_sync_gets_a_short_timeout_otherwise(store: SweepStore, executor: Ex
     except ClusterError:
         assert isinstance(executor, Unavailable)
     assert sync.patience == [10.0]
-    assert all(trial.record().status is not TrialState.RUNNING for trial in store.trials())
+    assert all(trial.record().status is not TrialStatus.RUNNING for trial in store.trials())
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -25,7 +25,7 @@ from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
 from recrl.orchestrator.trial.attempt import run_recorded
 from recrl.orchestrator.trial.saved_policy import NoCheckpointError, SavedTrial, summary
 from recrl.orchestrator.trial.videos import VideoFormat
@@ -129,7 +129,7 @@ def test_an_evaluation_ends_although_only_some_episodes_do(
 
 def test_a_stopped_trial_is_looked_at_as_far_as_it_is(tmp_path: Path) -> None:
     store = run(tmp_path, SPEC, updates=2)
-    assert store.record().status is TrialState.WAITING
+    assert store.record().status is TrialStatus.WAITING
     assert SavedTrial.load(store).update == 2
     assert not store.evaluation_path.exists()
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from recrl.environments.cmdp import CostLimits
-from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
 
 SPEC = TrialSpec(
     task=Choice("rivergrid-1a"),
@@ -65,4 +65,4 @@ def test_folder_name_is_safe_and_readable() -> None:
 
 
 def test_only_complete_and_failed_are_finished() -> None:
-    assert [state for state in TrialState if state.is_finished] == [TrialState.COMPLETE, TrialState.FAILED]
+    assert [state for state in TrialStatus if state.is_finished] == [TrialStatus.COMPLETE, TrialStatus.FAILED]

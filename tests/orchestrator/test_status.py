@@ -20,7 +20,7 @@ from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.launch_plan import make_plan
 from recrl.orchestrator.process_scope import process_scope
-from recrl.orchestrator.spec import TrialSpec, TrialState
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.sweep_progress import (
     DisplayStatus,
     SweepProgress,
@@ -44,7 +44,7 @@ def _trial(spec: TrialSpec, record: TrialRecord) -> TrialProgress:
     return TrialProgress(spec, display_status(record, now=1000.0, silence_seconds=300.0), record)
 
 
-RUNNING = TrialRecord(TrialState.RUNNING, attempt=1, env_steps=250, heartbeat=995.0, steps_per_second=50.0)
+RUNNING = TrialRecord(TrialStatus.RUNNING, attempt=1, env_steps=250, heartbeat=995.0, steps_per_second=50.0)
 
 
 def test_a_silent_trial_is_interrupted() -> None:
@@ -91,9 +91,9 @@ def test_the_grid_says_how_long_a_trial_may_be_silent(
     ("record", "status"),
     [
         (TrialRecord(), DisplayStatus.WAITING),
-        (TrialRecord(TrialState.WAITING, attempt=1), DisplayStatus.STOPPED),
-        (TrialRecord(TrialState.COMPLETE, attempt=1), DisplayStatus.COMPLETE),
-        (TrialRecord(TrialState.FAILED, attempt=1), DisplayStatus.FAILED),
+        (TrialRecord(TrialStatus.WAITING, attempt=1), DisplayStatus.STOPPED),
+        (TrialRecord(TrialStatus.COMPLETE, attempt=1), DisplayStatus.COMPLETE),
+        (TrialRecord(TrialStatus.FAILED, attempt=1), DisplayStatus.FAILED),
     ],
 )
 def test_every_state_has_its_display_status(record: TrialRecord, status: DisplayStatus) -> None:
@@ -106,8 +106,8 @@ def test_the_time_left_counts_what_runs_and_what_waits_but_not_what_failed() -> 
             _trial(SPECS[0], RUNNING),
             _trial(SPECS[1], replace(RUNNING, steps_per_second=100.0, env_steps=500)),
             _trial(SPECS[2], TrialRecord()),
-            _trial(SPECS[3], TrialRecord(TrialState.COMPLETE, attempt=1, env_steps=1000)),
-            _trial(SPECS[4], TrialRecord(TrialState.FAILED, attempt=1, env_steps=10)),
+            _trial(SPECS[3], TrialRecord(TrialStatus.COMPLETE, attempt=1, env_steps=1000)),
+            _trial(SPECS[4], TrialRecord(TrialStatus.FAILED, attempt=1, env_steps=10)),
         )
     )
     assert sweep.steps_per_second == 150.0
@@ -133,7 +133,7 @@ def test_progress_is_what_the_files_say(tmp_path: Path) -> None:
     store = SweepStore(tmp_path, "status")
     writer = store.trial(SPECS[0]).begin(SPECS[0])
     writer.commit({}, update=1, env_steps=1000)
-    writer.close(TrialState.COMPLETE)
+    writer.close(TrialStatus.COMPLETE)
     store.trial(SPECS[1]).begin(SPECS[1]).heartbeat(update=1, env_steps=500, steps_per_second=7.0)
     sweep = progress(SPECS, store)
     statuses = [trial.status for trial in sweep.trials]

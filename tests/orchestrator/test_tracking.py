@@ -29,7 +29,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.process_scope import process_scope
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.tracking import mlflow_sync
 from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.tracking.chart_view import view_tag
@@ -237,14 +237,14 @@ def test_a_place_that_mlflow_cannot_keep_a_sweep_in_is_refused(tmp_path: Path, g
 @pytest.mark.parametrize(
     ("status", "live", "expected"),
     [
-        (TrialState.COMPLETE, True, "FINISHED"),
-        (TrialState.FAILED, True, "FAILED"),
-        (TrialState.RUNNING, True, "RUNNING"),
-        (TrialState.WAITING, True, "SCHEDULED"),
-        (TrialState.WAITING, False, "KILLED"),
+        (TrialStatus.COMPLETE, True, "FINISHED"),
+        (TrialStatus.FAILED, True, "FAILED"),
+        (TrialStatus.RUNNING, True, "RUNNING"),
+        (TrialStatus.WAITING, True, "SCHEDULED"),
+        (TrialStatus.WAITING, False, "KILLED"),
     ],
 )
-def test_run_states_are_true(status: TrialState, live: bool, expected: str) -> None:
+def test_run_states_are_true(status: TrialStatus, live: bool, expected: str) -> None:
     record = TrialRecord(
         status=status, attempt=1, heartbeat=time.time(), pid=os.getpid(), pid_scope=process_scope()
     )
@@ -255,7 +255,7 @@ def test_a_trial_that_died_or_fell_silent_does_not_run_for_ever() -> None:
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     here = TrialRecord(
-        status=TrialState.RUNNING, heartbeat=time.time(), pid=process.pid, pid_scope=process_scope()
+        status=TrialStatus.RUNNING, heartbeat=time.time(), pid=process.pid, pid_scope=process_scope()
     )
     assert trial_run_status(here, live=True, silence_seconds=300.0) == "KILLED"
     elsewhere = replace(here, pid_scope="another container of this host")
@@ -622,7 +622,7 @@ def test_a_trial_that_ran_again_does_not_keep_the_outcome_of_before(write: Calla
     assert found is not None
     assert found.cpu_seconds == before.cpu_seconds > 0.0
     assert not outcomes.lack_a_complete_trial()
-    assert outcomes.of(trial.spec, replace(before, status=TrialState.RUNNING)) is None
+    assert outcomes.of(trial.spec, replace(before, status=TrialStatus.RUNNING)) is None
     again = replace(before, cpu_seconds=before.cpu_seconds + 0.25)
     assert outcomes.of(trial.spec, again) is None
     with trial.locked():
@@ -643,7 +643,7 @@ def test_trials_that_left_the_grid_are_averaged_with_none_of_it(write: Callable[
     kept = [spec for spec in store.specs() if spec.title != DYNAMIC]
     store.write_specs(kept)
     trial = trial_titled(store, DYNAMIC)
-    trial.set_status(TrialState.FAILED, error="no luck")
+    trial.set_status(TrialStatus.FAILED, error="no luck")
     sync(store, uri)
     shown = runs(store)
     assert shown[DYNAMIC].data.tags["recrl.group"] == "dynamic, cpo, river-a, no longer in the grid"
@@ -732,7 +732,7 @@ def test_failed_trials_are_in_the_table_of_verdicts() -> None:
         FinalOutcome(str(seed), group, 4.0, (1.0,), (1.0,), is_feasible=True, is_solved=not seed, exact=True)
         for seed in range(2)
     ]
-    complete, failed, waiting = TrialState.COMPLETE, TrialState.FAILED, TrialState.WAITING
+    complete, failed, waiting = TrialStatus.COMPLETE, TrialStatus.FAILED, TrialStatus.WAITING
     states = {group: [complete, failed, complete, failed, waiting], other: [failed, failed]}
     assert verdict_lines(outcomes, states)[2:] == [
         "| map | cpo | none | solved 1 of 5, feasible 1 of 5, failed 2 of 5, no result yet 1 of 5 "
@@ -861,7 +861,7 @@ def test_a_sync_that_is_stopped_shows_everything_first(write: Callable[..., Swee
     uri = tracking_uri(store, None)
     background = start_sync(store, uri, interval_seconds=3600.0)
     wait_until(lambda: mlflow_sync.last_report(store, uri) is not None)
-    trial_titled(store, DYNAMIC).set_status(TrialState.WAITING)
+    trial_titled(store, DYNAMIC).set_status(TrialStatus.WAITING)
     assert background.stop(timeout=60.0)
     assert {name: run.info.status for name, run in runs(store).items()} == {
         "made-up": "KILLED",

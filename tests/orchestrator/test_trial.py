@@ -23,7 +23,7 @@ from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
 from recrl.environments.vector import CMDPVectorEnv
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
 from recrl.orchestrator.trial.attempt import run_recorded
 from recrl.orchestrator.trial.trial import Trial
 from recrl.teachers.registry import TEACHERS, make_teacher
@@ -63,8 +63,8 @@ def run(
     store = SweepStore(folder, "sweep").trial(spec)
     for updates in stops:
         state = run_recorded(spec, store, should_stop=stop_after(updates), on_gpu=on_gpu)
-        assert state is TrialState.WAITING
-    assert run_recorded(spec, store, should_stop=never, on_gpu=on_gpu) is TrialState.COMPLETE
+        assert state is TrialStatus.WAITING
+    assert run_recorded(spec, store, should_stop=never, on_gpu=on_gpu) is TrialStatus.COMPLETE
     return store
 
 
@@ -103,9 +103,9 @@ def assert_pieces_make_the_whole(folder: Path, spec: TrialSpec, stops: tuple[int
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device")
 def test_a_trial_without_the_gpu_that_it_is_to_learn_on_fails(tmp_path: Path) -> None:
     store = SweepStore(tmp_path, "sweep").trial(SPEC)
-    assert run_recorded(SPEC, store, should_stop=never, on_gpu=True) is TrialState.FAILED
+    assert run_recorded(SPEC, store, should_stop=never, on_gpu=True) is TrialStatus.FAILED
     assert "cannot use a GPU here; install torch with CUDA and a driver" in str(store.record().error)
-    assert run_recorded(SPEC, store, should_stop=never) is TrialState.COMPLETE
+    assert run_recorded(SPEC, store, should_stop=never) is TrialStatus.COMPLETE
     attempts = json.loads(store.provenance_path.read_text())["attempts"]
     assert [attempt["device"] for attempt in attempts] == ["cpu"]
 
@@ -118,8 +118,8 @@ def test_a_trial_on_a_gpu_is_resumed_there_and_on_a_cpu(agent: str, task: str, t
     whole = run(tmp_path / "whole", spec, on_gpu=True)
     pieces = run(tmp_path / "pieces", spec, stops=(7, 5), on_gpu=True)
     moved = SweepStore(tmp_path / "moved", "sweep").trial(spec)
-    assert run_recorded(spec, moved, should_stop=stop_after(7), on_gpu=True) is TrialState.WAITING
-    assert run_recorded(spec, moved, should_stop=never) is TrialState.COMPLETE
+    assert run_recorded(spec, moved, should_stop=stop_after(7), on_gpu=True) is TrialStatus.WAITING
+    assert run_recorded(spec, moved, should_stop=never) is TrialStatus.COMPLETE
     np.testing.assert_equal(final_tree(pieces), final_tree(whole))
     assert pieces.evaluation_path.read_bytes() == whole.evaluation_path.read_bytes()
     assert len(pd.read_csv(moved.updates_path)) == spec.num_updates
@@ -174,9 +174,9 @@ def test_killed_and_resumed_equals_undisturbed(undisturbed: TrialStore, tmp_path
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
-    assert store.record().status is TrialState.RUNNING  # it had no time to say otherwise
+    assert store.record().status is TrialStatus.RUNNING  # it had no time to say otherwise
     assert store.record().update == 3
-    assert run_recorded(SPEC, store, should_stop=never) is TrialState.COMPLETE
+    assert run_recorded(SPEC, store, should_stop=never) is TrialStatus.COMPLETE
     assert store.episodes_path.read_bytes() == undisturbed.episodes_path.read_bytes()
     np.testing.assert_equal(final_tree(store), final_tree(undisturbed))
 
@@ -193,7 +193,7 @@ def test_a_trial_uses_one_thread_and_leaves_pytorch_those_it_had(
     before = torch.get_num_threads()
     torch.set_num_threads(3)
     try:
-        assert run_recorded(SPEC, store, should_stop=look) is TrialState.COMPLETE
+        assert run_recorded(SPEC, store, should_stop=look) is TrialStatus.COMPLETE
         assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)
@@ -287,8 +287,8 @@ class Opaque:
 def test_a_teachers_state_is_opaque_to_the_trial(undisturbed: TrialStore, tmp_path: Path) -> None:
     store = SweepStore(tmp_path, "sweep").trial(SPEC)
     teacher = Opaque(SPEC.teacher)
-    assert run_recorded(SPEC, store, should_stop=stop_after(5), teacher=teacher) is TrialState.WAITING
-    assert run_recorded(SPEC, store, should_stop=never, teacher=teacher) is TrialState.COMPLETE
+    assert run_recorded(SPEC, store, should_stop=stop_after(5), teacher=teacher) is TrialStatus.WAITING
+    assert run_recorded(SPEC, store, should_stop=never, teacher=teacher) is TrialStatus.COMPLETE
     assert store.episodes_path.read_bytes() == undisturbed.episodes_path.read_bytes()
     assert list(store.updates()) == list(undisturbed.updates())
     assert store.record().start_limits == undisturbed.record().start_limits
@@ -303,7 +303,7 @@ def test_the_names_of_several_costs_are_recorded(undisturbed: TrialStore, tmp_pa
         deploy_limits=CostLimits((3.0, 3.0)),
     )
     store = SweepStore(tmp_path, "sweep").trial(spec)
-    assert run_recorded(spec, store, should_stop=stop_after(1)) is TrialState.WAITING
+    assert run_recorded(spec, store, should_stop=stop_after(1)) is TrialStatus.WAITING
     assert store.provenance()[0]["cost_names"] == ["wear", "noise"]
     assert "cost_names" not in undisturbed.provenance()[0]
 
@@ -322,7 +322,7 @@ class Rising:
 def test_a_limit_that_rises_fails_the_trial(tmp_path: Path) -> None:
     spec = replace(SPEC, method=Choice("mine:RISING", label="rising"))
     store = SweepStore(tmp_path, "sweep").trial(spec)
-    assert run_recorded(spec, store, should_stop=never, teacher=Rising()) is TrialState.FAILED
+    assert run_recorded(spec, store, should_stop=never, teacher=Rising()) is TrialStatus.FAILED
     assert store.record().error == (
         "ValueError: curriculum rising: the limit of wear rose from 9 to 12 after update 2; limits may only "
         "fall (in update 2; no checkpoint before it)"
@@ -339,7 +339,7 @@ def test_an_agent_whose_entropy_cannot_be_rewarded_is_named(
     monkeypatch.setattr("recrl.orchestrator.trial.trial.make_agent", without_it)
     spec = replace(SPEC, method=Choice("cooling"))
     store = SweepStore(tmp_path, "sweep").trial(spec)
-    assert run_recorded(spec, store, should_stop=never) is TrialState.FAILED
+    assert run_recorded(spec, store, should_stop=never) is TrialStatus.FAILED
     assert "method cooling rewards entropy, which agent ppo-lag does not support" in store.record().error
 
 
@@ -363,7 +363,7 @@ def test_a_task_that_is_not_finite_has_no_table(tmp_path: Path) -> None:
 def test_a_finished_trial_has_nothing_left_to_do(undisturbed: TrialStore, tmp_path: Path) -> None:
     store = run(tmp_path)
     before = store.episodes_path.read_bytes()
-    assert run_recorded(SPEC, store, should_stop=never) is TrialState.COMPLETE
+    assert run_recorded(SPEC, store, should_stop=never) is TrialStatus.COMPLETE
     assert store.episodes_path.read_bytes() == before
 
 
@@ -372,10 +372,10 @@ def test_a_trial_that_is_stopped_in_its_evaluation_is_evaluated_by_the_next_laun
 ) -> None:
     stopped = SweepStore(tmp_path, "sweep").trial(SPEC)
     state = run_recorded(SPEC, stopped, should_stop=stop_after(SPEC.num_updates + 1))
-    assert state is TrialState.WAITING
+    assert state is TrialStatus.WAITING
     assert stopped.record().update == SPEC.num_updates
     assert not stopped.evaluation_path.exists()
-    assert run_recorded(SPEC, stopped, should_stop=never) is TrialState.COMPLETE
+    assert run_recorded(SPEC, stopped, should_stop=never) is TrialStatus.COMPLETE
     assert stopped.evaluation_path.read_bytes() == undisturbed.evaluation_path.read_bytes()
 
 
@@ -390,7 +390,7 @@ def test_a_stopping_worker_that_is_ended_by_a_second_signal_waits(
 
     monkeypatch.setattr(Trial, "advance", advance)
     store = SweepStore(tmp_path, "sweep").trial(SPEC)
-    assert run_recorded(SPEC, store, should_stop=lambda: bool(stopping)) is TrialState.WAITING
+    assert run_recorded(SPEC, store, should_stop=lambda: bool(stopping)) is TrialStatus.WAITING
 
 
 @pytest.mark.parametrize("failing", [False, True])
@@ -406,14 +406,14 @@ def test_environments_are_closed_and_an_error_of_that_fails_nothing(
 
     monkeypatch.setattr(FiniteVectorEnv, "close_extras", close)
     store = SweepStore(tmp_path, "small").trial(SPEC)
-    assert run_recorded(SPEC, store, should_stop=lambda: False) is TrialState.COMPLETE
+    assert run_recorded(SPEC, store, should_stop=lambda: False) is TrialStatus.COMPLETE
     assert len(closed) == 3  # of the training, and of two evaluations
 
 
 def test_a_trial_that_raises_is_failed_with_its_traceback(tmp_path: Path) -> None:
     spec = replace(SPEC, agent=Choice("ppo-lag", {**SMALL, "hidden_sizes": ["not a number"]}))
     store = SweepStore(tmp_path, "sweep").trial(spec)
-    assert run_recorded(spec, store, should_stop=never) is TrialState.FAILED
+    assert run_recorded(spec, store, should_stop=never) is TrialStatus.FAILED
     assert "not a number" in store.record().error
     assert "Traceback" in store.error_path.read_text()
     assert "failed; its files end at update 0" in store.log_path.read_text()

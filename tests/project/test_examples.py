@@ -14,7 +14,7 @@ from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.run_sweep import SweepRunSettings, run_sweep
-from recrl.orchestrator.spec import TrialState
+from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.sweep_place import SweepPlace
 from tests.project.documentation import ROOT
 
@@ -57,7 +57,7 @@ def test_a_trial_of_ones_own_task_agent_and_teacher_runs(
     store = SweepStore(tmp_path, grid.name)
     run_sweep(SweepRunSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
     (trial,) = store.trials()
-    assert trial.record().status is TrialState.COMPLETE
+    assert trial.record().status is TrialStatus.COMPLETE
     updates = trial.updates()
     held = updates["end_step"] <= 0.25 * 1520
     assert updates.loc[held, "limit_0"].iloc[1:].nunique() == 1  # the first is infinite
@@ -111,7 +111,7 @@ def test_an_agent_learns_with_a_network_of_ones_own(tmp_path: Path, monkeypatch:
     grid = parse_grid(text.encode(), source="grid.yaml")
     store = SweepStore(tmp_path, grid.name)
     run_sweep(SweepRunSettings(grid, SweepPlace(store), InlineExecutor()), stop=threading.Event())
-    assert store.trials()[0].record().status is TrialState.COMPLETE
+    assert store.trials()[0].record().status is TrialStatus.COMPLETE
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*/*.py")), ids=lambda path: path.stem)

@@ -519,6 +519,28 @@ def test_noise_is_not_judged_before_there_are_enough_episodes() -> None:
     assert not is_precise(WindowStatistics(100, 0, 0.0, (0.0,), (0.0,)), config)
 
 
+@pytest.mark.parametrize(("episodes", "error"), [(100, 0.1), (400, 0.05)])
+def test_a_constant_policy_passes_as_often_as_the_standard_errors_of_its_means_say(
+    episodes: int, error: float
+) -> None:
+    """The difference of two means has sqrt(2) times their standard error, here in standard deviations."""
+    tolerance, pairs = 0.1, 4000
+    returns = np.random.default_rng(0).normal(0.0, 5.0, (pairs, 2, episodes))
+    means, scatters = returns.mean(axis=2), returns.var(axis=2) * episodes
+    passed = 0
+    for (old, new), (old_scatter, new_scatter) in zip(means, scatters, strict=True):
+        (limit,), _ = decided(
+            WindowStatistics(1, episodes, float(old), (9.0,), (0.0,), float(old_scatter)),
+            WindowStatistics(1, episodes, float(new), (9.0,), (0.0,), float(new_scatter)),
+            limits=(9.0,),
+            deploy=(5.0,),
+            return_tolerance=tolerance,
+        )
+        passed += limit < 9.0  # only a converged limit falls; the cost is constant
+    expected = math.erf(tolerance / (2.0 * error))  # 52% and 84%
+    assert passed / pairs == pytest.approx(expected, abs=0.03)
+
+
 def test_a_noisy_agent_is_held_where_it_is_until_a_hundred_episodes_say_that_it_has_converged() -> None:
     generator = np.random.default_rng(1)
     spec = TeacherSpec("dynamic", {"window": 2}, CostLimits((200.0,)), CostLimits((25.0,)), 1_000_000)

@@ -20,7 +20,7 @@ from recrl.orchestrator.files.move_aside import move_aside
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.files.trial_writer import TrialWriter
-from recrl.orchestrator.spec import Choice, TrialSpec, TrialState
+from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
 
 SPEC = TrialSpec(
     task=Choice("two-state"),
@@ -186,7 +186,7 @@ def test_only_the_newest_attempt_may_write(store: TrialStore) -> None:
     writes: list[Callable[[], None]] = [
         lambda: orphan.commit(tree(2), update=2, env_steps=20),
         lambda: orphan.heartbeat(update=2, env_steps=20, steps_per_second=1.0),
-        lambda: orphan.close(TrialState.COMPLETE),
+        lambda: orphan.close(TrialStatus.COMPLETE),
         lambda: orphan.write_evaluation([{"policy": "stochastic"}]),
     ]
     for write in writes:
@@ -195,7 +195,7 @@ def test_only_the_newest_attempt_may_write(store: TrialStore) -> None:
     assert store.episodes_path.read_bytes() == before
     assert store.record().attempt == 2
     work(heir, 2)
-    assert store.record().status is TrialState.RUNNING
+    assert store.record().status is TrialStatus.RUNNING
 
 
 def test_a_commit_that_fails_leaves_the_one_before(store: TrialStore) -> None:
@@ -302,8 +302,8 @@ def _killed(*_: object, **__: object) -> None:
 
 
 def test_the_traceback_of_an_earlier_attempt_is_moved_aside(store: TrialStore) -> None:
-    store.begin(SPEC).close(TrialState.FAILED, error="no luck", traceback="Traceback of the first")
-    store.begin(SPEC).close(TrialState.COMPLETE)
+    store.begin(SPEC).close(TrialStatus.FAILED, error="no luck", traceback="Traceback of the first")
+    store.begin(SPEC).close(TrialStatus.COMPLETE)
     assert not store.error_path.exists()
     assert [path.read_text() for path in store.aside_folder.iterdir()] == ["Traceback of the first"]
 

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from recrl.analysis.data import sweep_data
-from recrl.analysis.data.labels import KEY
+from recrl.analysis.data.labels import KEY, METHOD_ORDER
 from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.figures.styles import STYLES
 from recrl.environments.cmdp import Phase
 from recrl.environments.registry import optimal_return
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.teachers.registry import TEACHERS
 
 
 def test_every_frame_begins_with_the_key(finished: Sweep) -> None:
@@ -26,6 +28,10 @@ def test_every_frame_begins_with_the_key(finished: Sweep) -> None:
     ):
         assert tuple(frame.columns[:4]) == KEY
         assert len(frame)
+
+
+def test_every_curriculum_of_ours_has_a_place_in_the_order() -> None:
+    assert sorted(METHOD_ORDER) == sorted(TEACHERS) == sorted(STYLES)
 
 
 def test_methods_come_in_one_order_everywhere(finished: Sweep) -> None:

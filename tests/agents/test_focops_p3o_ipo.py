@@ -22,7 +22,7 @@ from recrl.agents.learning.distributions import Categorical
 from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
-from recrl.agents.networks.architecture import NetworkForm, orthogonal
+from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.environments.cmdp import Floats
 
 STATES = np.array([0, 0, 1, 1, 1, 2])
@@ -125,7 +125,7 @@ def test_the_trust_region_is_kept_however_long_a_step_is(agent: str) -> None:
     found = {}
     for name in ("kept", "passed"):
         policy = StochasticPolicy(
-            3, Discrete(2), NetworkForm((8,), orthogonal), 1.0, torch.Generator().manual_seed(0)
+            3, Discrete(2), NetworkArchitecture((8,), orthogonal), 1.0, torch.Generator().manual_seed(0)
         )
         constraints = Constraints(np.array([math.inf]), np.array([-math.inf]), np.zeros(1), 10.0)
         experience = Experience.of(policy, BATCH, ADVANTAGES, constraints)
@@ -143,7 +143,7 @@ def test_the_trust_region_is_kept_however_long_a_step_is(agent: str) -> None:
 def improved(name: str, gap: float, limit: float = 5.0) -> tuple[dict[str, float], bool]:
     """The metrics of one update, and whether the policy is another."""
     generator = torch.Generator().manual_seed(0)
-    policy = StochasticPolicy(3, Discrete(2), NetworkForm((8,), orthogonal), 1.0, generator)
+    policy = StochasticPolicy(3, Discrete(2), NetworkArchitecture((8,), orthogonal), 1.0, generator)
     before = policy.parameters.to_numpy()
     rules: dict[str, PolicyRule] = {
         "focops": FirstOrderConstrainedOptimisation(FOCOPSConfig(), policy, 1),
