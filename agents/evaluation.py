@@ -44,7 +44,7 @@ class FrozenPolicy(StrEnum):
 
 
 @dataclass(frozen=True)
-class _Actor:
+class EvaluatedPolicy:
     """What a collector uses of a final policy."""
 
     actor: FinalPolicy
@@ -98,7 +98,7 @@ def evaluate(
                 f"evaluation: no episode ended in {MAX_STEPS:,} steps of an environment; the task must "
                 "return terminated or truncated at some time (gymnasium.wrappers.TimeLimit does)"
             )
-        _, finished = collector.collect(_Actor(actor, policy), generator)
+        _, finished = collector.collect(EvaluatedPolicy(actor, policy), generator)
         steps += CHUNK_STEPS
         for episode in finished:
             if len(done[episode.environment]) < shares[episode.environment]:
@@ -151,7 +151,7 @@ def film(
     """
     environment_seed, policy_seed = _spawned(seed)
     generator = np.random.default_rng(policy_seed)
-    chooser = _Actor(actor, policy)
+    chooser = EvaluatedPolicy(actor, policy)
     # Some simulators take signed seeds only.
     observation, _ = environment.reset(seed=int(environment_seed.generate_state(1)[0] >> 1))
     episode_return, costs = 0.0, np.zeros(num_costs)

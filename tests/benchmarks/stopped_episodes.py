@@ -20,7 +20,7 @@ import pandas as pd
 import torch
 
 from recrl.agents.collection import Collector
-from recrl.agents.evaluation import FrozenPolicy, _Actor
+from recrl.agents.evaluation import FrozenPolicy, EvaluatedPolicy
 from recrl.environments.registry import make_vector
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.trial.saved_policy import SavedTrial
@@ -36,7 +36,7 @@ def outcomes(
     assert horizon is not None
     collector = Collector(environments, num_steps=horizon)
     collector.reset(seed=seed)
-    rollout, finished = collector.collect(_Actor(trial.policy, policy), np.random.default_rng(seed))
+    rollout, finished = collector.collect(EvaluatedPolicy(trial.policy, policy), np.random.default_rng(seed))
     if [episode.length for episode in finished] != [horizon] * number:
         raise SystemExit(f"{task.name}: an episode did not last {horizon} steps")
     costs = rollout.costs[..., 0]

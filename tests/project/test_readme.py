@@ -26,6 +26,7 @@ DEFINITIONS = {
     "": {"2024": "a year"},
     "What was found": {
         "2e6": "steps of a trial",
+        "22.5": "a limit",
         "1e7": "steps of a published run",
         "120": "a count, see test_the_table_of_rivergrid_is_counted",
         "0.21": "a p-value, likewise",
