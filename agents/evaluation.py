@@ -51,6 +51,7 @@ class EvaluatedPolicy:
     policy: FrozenPolicy
 
     def act(self, observations: npt.NDArray[np.float32], generator: np.random.Generator) -> npt.NDArray[Any]:
+        """Choose actions; a deterministic policy leaves the generator as it is."""
         if self.policy is FrozenPolicy.DETERMINISTIC:
             return self.actor.act_greedily(observations)
         return self.actor.act(observations, generator)

@@ -20,7 +20,7 @@ import pandas as pd
 import torch
 
 from recrl.agents.collection import Collector
-from recrl.agents.evaluation import FrozenPolicy, EvaluatedPolicy
+from recrl.agents.evaluation import EvaluatedPolicy, FrozenPolicy
 from recrl.environments.registry import make_vector
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.trial.saved_policy import SavedTrial
