@@ -46,6 +46,7 @@ class Comparison:
     best: dict[str, Any]
     best_of_three: dict[str, Any] | None
     best_within: dict[str, Any] | None
+    best_at_most_limit: dict[str, Any] | None
     best_stopped: dict[str, Any] | None
     p_value: float
 
@@ -88,6 +89,7 @@ def compared(task: str, rows: pd.DataFrame, published: pd.DataFrame) -> Comparis
         best,
         best_of(of_task[of_task["agent"].isin(THREE)]),
         best_of(of_task[~stopped & keeps_limit]),
+        best_of(of_task[~stopped & (of_task["cost"] <= LIMIT)]),
         best_of(of_task[stopped]),
         float(test.pvalue),
     )
@@ -117,6 +119,9 @@ def print_comparison(comparisons: Sequence[Comparison]) -> None:
         "mean cost keeps the limit": [one.keeps_limit for one in comparisons],
         "mean return above all that keep the limit": [one.above(one.best_within) for one in comparisons],
         "that, and the limit kept": [one.above(one.best_within) and one.keeps_limit for one in comparisons],
+        "above all with a mean cost of at most the limit, and ours is, too": [
+            one.above(one.best_at_most_limit) and one.ours.cost <= LIMIT for one in comparisons
+        ],
         "mean return above the two stopped at the limit": [
             one.above(one.best_stopped) for one in comparisons
         ],
