@@ -102,7 +102,7 @@ class Simulations:
         view = self._batch.view
         self.rows: Floats = view(self._library.mjb_state(address), np.float64, (number, size))
         self._warnings = view(self._library.mjb_warning(address), np.int32, (number, _NUM_WARNINGS, 2))
-        # they are neighbours in mjtWarning, so that this is a view
+        # The bad states are neighbours in mjtWarning, so this is a view.
         self._bad_states = self._warnings[:, min(BAD_STATES) : max(BAD_STATES) + 1, 1]
         self._status = view(self._library.mjb_status(address), np.int32, (number,))
         self.stopped = np.zeros(number, np.bool_)

@@ -152,10 +152,10 @@ def missing_modules_sentence(missing: Iterable[Collection[str]]) -> str:
     if not lacking:
         return ""
     first, *others = sorted(set().union(*lacking))
-    missing = f"{first} and {counted(len(others), 'other')} were" if others else f"{first} was"
+    subject = f"{first} and {counted(len(others), 'other')} were" if others else f"{first} was"
     return (
         f"the code of {counted(len(lacking), 'trial')} was not checked for changes, because the module "
-        f"{missing} not found; start the command in the folder that holds {'them' if others else 'it'}"
+        f"{subject} not found; start the command in the folder that holds {'them' if others else 'it'}"
     )
 
 

@@ -3,23 +3,23 @@
     R=results/safety-gym
     python -m tests.benchmarks.published_comparison $R/agents.csv $R/margin-half.csv $R/margin.csv
 
-Each table of ``final_policies.py`` is one comparison; joined by a plus sign, ``a.csv+b.csv``, they are one.
-Policies are judged at a limit of 25, whatever limit they were trained under. The cost has one standard error,
-over seeds or over all episodes, whichever is larger; the return has Student's 95% interval over seeds. An
-agent keeps the limit if its mean cost is at most one standard error above it.
+Each table is one of ``final_policies.py``, of one agent. Policies are judged at a limit of 25, whatever limit
+they were trained under. The return has Student's 95% interval over seeds. The cost has one standard error,
+over seeds or over all episodes, whichever is larger. An agent keeps the limit if its mean cost is at most one
+standard error above it.
 
 OmniSafe's evaluator stops an episode of its two early-terminated agents when its cost has reached the limit.
 That is another task, so they are not among the others but have a column of their own. What the number after
 the +- is, OmniSafe does not say. It is taken for a standard deviation over five seeds in two places: for
-whether a published agent keeps the limit, and in the last count. That is Welch's one-sided test, corrected
-for the tasks by Holm's method. The intervals take the published mean as exact.
+whether a published agent keeps the limit, and in Welch's one-sided test, which is corrected for the tasks by
+Holm's method. The intervals take the published mean as exact.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,25 +34,41 @@ from tests.benchmarks.velocity_table import LIMIT, Cell
 PUBLISHED = Path("results/safety-gym/published.csv")
 PUBLISHED_SEEDS = 5
 SIGNIFICANT = 0.05
-STOPPED = ("PPOEarlyTerminated", "TRPOEarlyTerminated")
-THREE = ("PPO-Lag", "CPO", "TRPO-Lag")
+
+Agent = Mapping[str, Any]  # a row of the published table
+
+
+def groups(published: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """The published agents on one task by what they are compared as; a group may be empty."""
+    stops = published["agent"].str.endswith("EarlyTerminated")
+    whole = published[~stops]
+    error = whole["cost_spread"] / math.sqrt(PUBLISHED_SEEDS)
+    return {
+        "all": whole,
+        "PPO-Lag, CPO and TRPO-Lag": whole[whole["agent"].isin(["PPO-Lag", "CPO", "TRPO-Lag"])],
+        "all that keep the limit": whole[whole["cost"] <= LIMIT + error],
+        "all with a mean cost of at most the limit": whole[whole["cost"] <= LIMIT],
+        "the two stopped at the limit": published[stops],
+    }
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Our policies on one task, and the published agents to compare them with; each may be missing."""
+    """Our policies on one task, and the best published agent of each group; None where it is empty."""
 
     ours: Cell
-    best: dict[str, Any]
-    best_of_three: dict[str, Any] | None
-    best_within: dict[str, Any] | None
-    best_at_most_limit: dict[str, Any] | None
-    best_stopped: dict[str, Any] | None
+    best: Mapping[str, Agent | None]
     p_value: float
 
-    def above(self, agent: dict[str, Any] | None) -> bool:
-        """Whether our mean return is above that of a published agent; true if there is none."""
+    def above(self, group: str) -> bool:
+        """Whether our mean return is above those of a group of published agents."""
+        agent = self.best[group]
         return agent is None or self.ours.episode_return > agent["return"]
+
+    def interval_above(self, group: str) -> bool:
+        """Whether the lower end of our interval is."""
+        agent = self.best[group]
+        return agent is None or self.ours.episode_return - self.ours.half_width > agent["return"]
 
     @property
     def keeps_limit(self) -> bool:
@@ -60,42 +76,31 @@ class Comparison:
         return self.ours.cost <= LIMIT + self.ours.cost_error
 
 
-def best_of(agents: pd.DataFrame) -> dict[str, Any] | None:
+def best_of(agents: pd.DataFrame) -> Agent | None:
     """The agent that earns most; none of an empty table."""
     rows = agents.sort_values("return").to_dict("records")
     return {str(key): value for key, value in rows[-1].items()} if rows else None
 
 
-def compared(task: str, rows: pd.DataFrame, published: pd.DataFrame) -> Comparison | None:
-    """The comparison on one task; none if nothing is published for it."""
-    of_task = published[published["task"] == task]
-    stopped = of_task["agent"].isin(STOPPED)
-    keeps_limit = of_task["cost"] <= LIMIT + of_task["cost_spread"] / math.sqrt(PUBLISHED_SEEDS)
-    best = best_of(of_task[~stopped])
-    if best is None:
-        return None
+def compared(task: str, rows: pd.DataFrame, published: pd.DataFrame) -> Comparison:
+    """Compare our policies on a task, a row a seed, with the published agents on it."""
+    best = {name: best_of(agents) for name, agents in groups(published).items()}
+    rival = best["all"]
+    assert rival is not None
     test = stats.ttest_ind_from_stats(
         rows["return"].mean(),
         rows["return"].std(),
         len(rows),
-        best["return"],
-        best["return_spread"],
+        rival["return"],
+        rival["return_spread"],
         PUBLISHED_SEEDS,
         equal_var=False,
         alternative="greater",
     )
-    return Comparison(
-        Cell.of(task, "", rows),
-        best,
-        best_of(of_task[of_task["agent"].isin(THREE)]),
-        best_of(of_task[~stopped & keeps_limit]),
-        best_of(of_task[~stopped & (of_task["cost"] <= LIMIT)]),
-        best_of(of_task[stopped]),
-        float(test.pvalue),
-    )
+    return Comparison(Cell.of(task, "", rows), best, float(test.pvalue))
 
 
-def published_text(agent: dict[str, Any] | None) -> str:
+def published_text(agent: Agent | None) -> str:
     """Return, cost and name of a published agent."""
     if agent is None:
         return "none"
@@ -104,48 +109,51 @@ def published_text(agent: dict[str, Any] | None) -> str:
 
 def print_comparison(comparisons: Sequence[Comparison]) -> None:
     """Print a row a task, and on how many tasks what holds."""
-    print("| task | return | cost | best published | best that keeps the limit | stopped at the limit |")
+    shown = ("all", "all that keep the limit", "the two stopped at the limit")
+    print(f"| task | return | cost | best of {' | best of '.join(shown)} |")
     print("|---|---|---|---|---|---|")
     for one in comparisons:
-        theirs = " | ".join(map(published_text, (one.best, one.best_within, one.best_stopped)))
+        theirs = " | ".join(published_text(one.best[group]) for group in shown)
         print(f"| {one.ours.task} | {one.ours.interval} | {one.ours.costs} | {theirs} |")
-    corrected = holm(np.array([one.p_value for one in comparisons]))
-    intervals = [one.ours.episode_return - one.ours.half_width > one.best["return"] for one in comparisons]
+    significant = holm(np.array([one.p_value for one in comparisons])) < SIGNIFICANT
     counts = {
-        "mean return above PPO-Lag, CPO and TRPO-Lag": [one.above(one.best_of_three) for one in comparisons],
-        "mean return above all": [one.above(one.best) for one in comparisons],
-        "its interval, too": intervals,
-        "above all by Welch's test, corrected": list(corrected < SIGNIFICANT),
+        f"mean return above {group}": [one.above(group) for one in comparisons]
+        for group in comparisons[0].best
+    }
+    counts |= {
+        "interval above all": [one.interval_above("all") for one in comparisons],
+        "above all by Welch's test, corrected": significant.tolist(),
         "mean cost keeps the limit": [one.keeps_limit for one in comparisons],
-        "mean return above all that keep the limit": [one.above(one.best_within) for one in comparisons],
-        "that, and the limit kept": [one.above(one.best_within) and one.keeps_limit for one in comparisons],
-        "above all with a mean cost of at most the limit, and ours is, too": [
-            one.above(one.best_at_most_limit) and one.ours.cost <= LIMIT for one in comparisons
+        "above all that keep the limit, and the limit kept": [
+            one.above("all that keep the limit") and one.keeps_limit for one in comparisons
         ],
-        "mean return above the two stopped at the limit": [
-            one.above(one.best_stopped) for one in comparisons
+        "above all with a mean cost of at most the limit, and ours is, too": [
+            one.above("all with a mean cost of at most the limit") and one.ours.cost <= LIMIT
+            for one in comparisons
         ],
     }
     for text, held in counts.items():
-        print(f"{text}: {sum(map(bool, held))} of {len(held)}")
+        print(f"{text}: {sum(held)} of {len(held)}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print a comparison for each table and each kind of policy."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("tables", nargs="+", help="tables of final policies, of one agent each")
+    parser.add_argument("tables", nargs="+", type=Path)
     parser.add_argument("--published", type=Path, default=PUBLISHED)
     given = parser.parse_args(arguments)
-    published = pd.read_csv(given.published, comment="#")
-    for joined in given.tables:
-        rows = pd.concat([pd.read_csv(path, comment="#") for path in joined.split("+")], ignore_index=True)
+    published = dict(list(pd.read_csv(given.published, comment="#").groupby("task")))
+    for table in given.tables:
+        rows = pd.read_csv(table, comment="#")
         for policy in ("stochastic", "deterministic"):
-            chosen = rows[rows["policy"] == policy]
+            chosen = rows[(rows["policy"] == policy) & rows["task"].isin(list(published))]
             if chosen.duplicated(["task", "seed"]).any():
-                raise SystemExit(f"{joined}: a task and seed is there twice")
-            found = [compared(str(task), group, published) for task, group in chosen.groupby("task")]
-            print(f"\n{joined}, {policy}, {chosen.groupby('task')['seed'].nunique().min()} or more seeds\n")
-            print_comparison([one for one in found if one is not None])
+                raise SystemExit(f"{table}: a task and seed is there twice")
+            seeds = chosen.groupby("task")["seed"].nunique().min()
+            print(f"\n{table}, {policy}, at least {seeds} seeds a task\n")
+            print_comparison(
+                [compared(str(task), group, published[task]) for task, group in chosen.groupby("task")]
+            )
 
 
 if __name__ == "__main__":

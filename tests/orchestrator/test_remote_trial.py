@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import fsspec
 import numpy as np
@@ -14,7 +13,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.errors import (
     DamagedError,
     LostLeaseError,
@@ -32,23 +30,10 @@ from recrl.orchestrator.remote.commit_format import PREFIX_BYTES, Commit, pack, 
 from recrl.orchestrator.remote.commit_upload import Upload, working_copy
 from recrl.orchestrator.remote.object_store import ObjectStore
 from recrl.orchestrator.remote.remote_trial import RemoteTrial
-from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
+from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.trial.attempt import run_recorded
 from tests.faults.unreliable import Unreliable
-
-SPEC = TrialSpec(
-    task=Choice("two-state"),
-    agent=Choice("ppo-lag"),
-    method=Choice("none"),
-    train_limits=CostLimits.unlimited(1),
-    deploy_limits=CostLimits((5.0,)),
-    train_steps=95,
-    deploy_steps=5,
-    num_envs=1,
-    rollout_steps=10,
-    evaluation_episodes=0,
-    seed=0,
-)
+from tests.orchestrator.trial_contents import SPEC, episode, tree
 
 
 @pytest.fixture(params=["file", "memory", "unreliable"])
@@ -76,23 +61,9 @@ class Machine:
 
     def work(self, update: int) -> None:
         """One update's rows, committed, and not yet sent."""
-        episode = EpisodeStats(
-            index=update,
-            phase=Phase.TRAINING,
-            end_step=10 * update,
-            length=10,
-            episode_return=0.1 * update,
-            costs=(1.0 / 3.0,),
-            limits=CostLimits.unlimited(1),
-            noise=0.0,
-        )
-        self.writer.append_episode(episode)
+        self.writer.append_episode(episode(update))
         self.writer.append_update({"update": update, "limit_0": float("inf")})
         self.writer.commit(tree(update), update=update, env_steps=10 * update)
-
-
-def tree(update: int) -> dict[str, Any]:
-    return {"update": update, "weights": np.full(3, update, dtype=np.float32)}
 
 
 def local_copy(remote: RemoteTrial, folder: Path, *, checkpoints: bool = True) -> TrialStore:

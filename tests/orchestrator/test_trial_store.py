@@ -13,46 +13,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.errors import DamagedError, LostLeaseError, StorageError, SweepBusyError
 from recrl.orchestrator.files.atomic_files import write_atomically
 from recrl.orchestrator.files.move_aside import move_aside
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.files.trial_writer import TrialWriter
-from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
-
-SPEC = TrialSpec(
-    task=Choice("two-state"),
-    agent=Choice("ppo-lag"),
-    method=Choice("none"),
-    train_limits=CostLimits.unlimited(1),
-    deploy_limits=CostLimits((5.0,)),
-    train_steps=95,
-    deploy_steps=5,
-    num_envs=1,
-    rollout_steps=10,
-    evaluation_episodes=0,
-    seed=0,
-)
+from recrl.orchestrator.spec import TrialStatus
+from tests.orchestrator.trial_contents import SPEC, episode, tree
 
 
 @pytest.fixture
 def store(tmp_path: Path) -> TrialStore:
     return SweepStore(tmp_path, "sweep").trial(SPEC)
-
-
-def episode(index: int) -> EpisodeStats:
-    return EpisodeStats(
-        index=index,
-        phase=Phase.TRAINING,
-        end_step=10 * index,
-        length=10,
-        episode_return=0.1 * index,
-        costs=(1.0 / 3.0,),
-        limits=CostLimits.unlimited(1),
-        noise=0.0,
-    )
 
 
 def work(writer: TrialWriter, update: int) -> None:
@@ -61,10 +34,6 @@ def work(writer: TrialWriter, update: int) -> None:
     writer.append_update({"update": update, "limit_0": float("inf"), "kl": float("nan")})
     writer.append_event({"update": update, "end_step": 10 * update, "event": "noise"})
     writer.commit(tree(update), update=update, env_steps=10 * update)
-
-
-def tree(update: int) -> dict[str, Any]:
-    return {"update": update, "weights": np.full(3, update, dtype=np.float32)}
 
 
 def test_committed_rows_read_back_exactly(store: TrialStore) -> None:
