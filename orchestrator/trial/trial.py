@@ -333,13 +333,15 @@ def evaluation_rows(
         actor: chooses the actions.
         spec: the trial.
         policies: stochastic, deterministic or both, each evaluated on the same environment stream.
-        num_episodes: of each, at least 0.
+        num_episodes: of each, at least 0. Fewer than the trial's environments run in as many environments
+            as there are episodes, so that none steps in vain.
         seed: of the environments and of the policy's randomness.
         should_stop: called between steps; once true, ``StoppedError`` is raised.
     """
     rows = []
+    num_envs = max(1, min(spec.num_envs, num_episodes))
     for policy in policies:
-        with open_environments(spec, spec.num_envs) as environments:
+        with open_environments(spec, num_envs) as environments:
             episodes = evaluate(
                 actor,
                 environments,

@@ -17,6 +17,8 @@ import pandas as pd
 import pytest
 import torch
 
+from recrl.agents.agent import FinalPolicy
+from recrl.agents.evaluation import evaluate
 from recrl.agents.registry import AGENTS, make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
@@ -24,6 +26,7 @@ from recrl.environments.vector import CMDPVectorEnv
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
+from recrl.orchestrator.trial import trial
 from recrl.orchestrator.trial.attempt import run_recorded
 from recrl.orchestrator.trial.trial import Trial
 from recrl.teachers.registry import TEACHERS, make_teacher
@@ -408,6 +411,21 @@ def test_environments_are_closed_and_an_error_of_that_fails_nothing(
     store = SweepStore(tmp_path, "small").trial(SPEC)
     assert run_recorded(SPEC, store, should_stop=lambda: False) is TrialStatus.COMPLETE
     assert len(closed) == 3  # of the training, and of two evaluations
+
+
+@pytest.mark.parametrize(("episodes", "environments"), [(0, 1), (3, 3), (4, 4), (6, 4)])
+def test_an_evaluation_of_few_episodes_makes_no_environment_that_it_does_not_use(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, episodes: int, environments: int
+) -> None:
+    evaluated = []
+
+    def watched(actor: FinalPolicy, made: CMDPVectorEnv, *rest: Any, **named: Any) -> Any:
+        evaluated.append(made.num_envs)
+        return evaluate(actor, made, *rest, **named)
+
+    monkeypatch.setattr(trial, "evaluate", watched)
+    run(tmp_path, replace(SPEC, evaluation_episodes=episodes))
+    assert evaluated == [environments, environments]  # stochastic and deterministic
 
 
 def test_a_trial_that_raises_is_failed_with_its_traceback(tmp_path: Path) -> None:
