@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
+from torch.optim.adam import adam
 
 
 class FlatParameters:
@@ -83,7 +84,10 @@ def _saved_parts(piece: Tensor) -> list[Tensor]:
 
 
 class Adam:
-    """``torch.optim.Adam`` on one flat block, with its state in the saved order.
+    """Adam on one flat block, with its state in the saved order.
+
+    It is PyTorch's functional Adam with the defaults of ``torch.optim.Adam``. That class imports PyTorch's
+    compiler, which takes seconds and memory in every process.
 
     Args:
         parameters: the block to optimise.
@@ -91,29 +95,42 @@ class Adam:
     """
 
     def __init__(self, parameters: FlatParameters, learning_rate: float) -> None:
-        values = parameters.values
-        values.grad = parameters.gradient
         self._parameters = parameters
-        self._optimiser = torch.optim.Adam([values], lr=learning_rate, foreach=False)
-        self._state = self._optimiser.state[values]
-        self._state["step"] = torch.tensor(0.0, device="cpu")
-        self._state["exp_avg"] = torch.zeros_like(values)
-        self._state["exp_avg_sq"] = torch.zeros_like(values)
+        self._learning_rate = learning_rate
+        self._first_moment = torch.zeros_like(parameters.values)
+        self._second_moment = torch.zeros_like(parameters.values)
+        self._steps = torch.tensor(0.0, device="cpu")
 
     def step(self) -> None:
         """Take a step of descent along the block's gradient."""
-        self._optimiser.step()
+        with torch.no_grad():
+            adam(
+                [self._parameters.values],
+                [self._parameters.gradient],
+                [self._first_moment],
+                [self._second_moment],
+                [],
+                [self._steps],
+                foreach=False,
+                amsgrad=False,
+                beta1=0.9,
+                beta2=0.999,
+                lr=self._learning_rate,
+                weight_decay=0.0,
+                eps=1e-8,
+                maximize=False,
+            )
 
     def state_dict(self) -> dict[str, Any]:
         """Return both moments, [P], and the number of steps taken."""
         return {
-            "first_moment": self._parameters.to_numpy(self._state["exp_avg"]),
-            "second_moment": self._parameters.to_numpy(self._state["exp_avg_sq"]),
-            "steps": int(self._state["step"]),
+            "first_moment": self._parameters.to_numpy(self._first_moment),
+            "second_moment": self._parameters.to_numpy(self._second_moment),
+            "steps": int(self._steps),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken."""
-        self._parameters.load(np.asarray(state["first_moment"]), self._state["exp_avg"])
-        self._parameters.load(np.asarray(state["second_moment"]), self._state["exp_avg_sq"])
-        self._state["step"].fill_(int(state["steps"]))
+        self._parameters.load(np.asarray(state["first_moment"]), self._first_moment)
+        self._parameters.load(np.asarray(state["second_moment"]), self._second_moment)
+        self._steps.fill_(int(state["steps"]))
