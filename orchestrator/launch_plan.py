@@ -128,6 +128,16 @@ class Plan:
         return tuple(it.code.missing for it in self.trials if it.action is not PlannedAction.RERUN)
 
     @property
+    def other_versions(self) -> tuple[frozenset[str], ...]:
+        """Return other versions of libraries of each begun or complete trial that is not run again.
+
+        It is empty if nothing is to do, because then no versions are mixed.
+        """
+        if not self.to_do:
+            return ()
+        return tuple(it.code.versions for it in self.trials if it.action is not PlannedAction.RERUN)
+
+    @property
     def counts(self) -> Mapping[PlannedAction, int]:
         """Number of trials by planned action."""
         found = Counter(trial.action for trial in self.trials)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import pandas as pd
@@ -20,6 +20,7 @@ from recrl.orchestrator.files.curriculum_warnings import (
 from recrl.orchestrator.provenance.code_changes import (
     InstalledCode,
     compare,
+    library_versions,
     missing_modules_sentence,
     other_code_sentence,
 )
@@ -45,7 +46,8 @@ def doubts(sweep: Sweep) -> list[str]:
     if other and sweep.folder is None:
         other += ", in a sweep's own folder"
     missing = missing_modules_sentence(code.missing for code in codes)
-    return [*filter(None, (other, missing, mixed_code_sentence(sweep))), *curriculum_warnings(sweep)]
+    mixed = (mixed_code_sentence(sweep), mixed_versions_sentence(sweep))
+    return [*filter(None, (other, missing, *mixed)), *curriculum_warnings(sweep)]
 
 
 def mixed_code_sentence(sweep: Sweep) -> str:
@@ -57,11 +59,29 @@ def mixed_code_sentence(sweep: Sweep) -> str:
     Returns:
         One sentence; empty if there are no such cells.
     """
+    parts = _mixed_cells(sweep, lambda attempt: attempt["code"])
+    remedy = "in a sweep's own folder, launch --rerun-changed makes it that of the installed version"
+    return f"the code that trials ran differs {parts}; {remedy}" if parts else ""
+
+
+def mixed_versions_sentence(sweep: Sweep) -> str:
+    """Name cells as ``mixed_code_sentence`` does, whose trials ran with different versions of libraries."""
+    parts = _mixed_cells(sweep, library_versions)
+    return f"versions of libraries differ {parts}: a difference may come from them" if parts else ""
+
+
+def _mixed_cells(sweep: Sweep, ran: Callable[[dict[str, Any]], Mapping[str, Any]]) -> str:
+    """Name cells whose trials ran different things; empty if there are none.
+
+    Args:
+        sweep: the sweep.
+        ran: digests or versions by name, of the last attempt of a trial.
+    """
     codes: dict[tuple[str, str, str], _Codes] = {}
     for group, trial in zip(sweep.groups, sweep.facts, strict=True):
         for last in attempts(trial)[-1:]:
-            code = {name: {str(digest)} for name, digest in last["code"].items()}
-            codes[group] = _joined(codes.get(group, {}), code)
+            of_trial = {name: {str(value)} for name, value in ran(last).items()}
+            codes[group] = _joined(codes.get(group, {}), of_trial)
     averaged = [group for group, found in codes.items() if _is_mixed(found)]
     compared = []
     for (task, agent, method), found in codes.items():
@@ -72,8 +92,7 @@ def mixed_code_sentence(sweep: Sweep) -> str:
         *([f"between seeds that are averaged ({_cells(averaged)})"] if averaged else []),
         *([f"between {BASELINE} and curricula compared with it ({_cells(compared)})"] if compared else []),
     ]
-    remedy = "in a sweep's own folder, launch --rerun-changed makes it that of the installed version"
-    return f"the code that trials ran differs {' and '.join(parts)}; {remedy}" if parts else ""
+    return " and ".join(parts)
 
 
 def _joined(one: _Codes, other: _Codes) -> _Codes:

@@ -20,6 +20,7 @@ from recrl.orchestrator.provenance.code_changes import (
     compare_files,
     missing_modules_sentence,
     other_code_sentence,
+    other_versions_sentence,
 )
 from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.tracking.client import tracking_uri
@@ -85,15 +86,19 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
 
 
 def _warn_of_other_code(evaluated: Sequence[SavedTrial], console: Console) -> None:
-    """Print the numbers of trials that ran other code than evaluated them, or code that is not found."""
+    """Print the numbers of trials that ran other code or libraries than now, or code that is not found."""
     installed = InstalledCode()
     codes = [compare_files(saved.store, saved.spec, installed) for saved in evaluated]
     changed = [saved for saved, code in zip(evaluated, codes, strict=True) if code.differs]
     complete = sum(saved.store.record().status is TrialStatus.COMPLETE for saved in changed)
     if sentence := other_code_sentence(complete, len(changed) - complete):
         say(console, f"warning: {sentence}; these evaluations use the installed code")
-    if sentence := missing_modules_sentence(code.missing for code in codes):
-        say(console, f"warning: {sentence}")
+    for sentence in (
+        missing_modules_sentence(code.missing for code in codes),
+        other_versions_sentence(code.versions for code in codes),
+    ):
+        if sentence:
+            say(console, f"warning: {sentence}")
 
 
 def _film(

@@ -1,4 +1,4 @@
-"""Detect whether a trial ran other code than is installed now.
+"""Detect whether a trial ran other code, or with other versions of libraries, than is installed now.
 
 A trial's results depend on recrl's tasks, agents, curricula and training loop, not on figures or commands:
 only the former are in the digest. A user's task, agent or curriculum has a digest of its top-level package
@@ -8,6 +8,9 @@ in the working directory are found also where a command may not import them.
 
 The project is the nearest folder above the module that holds a project file or a repository, else the
 module's own folder. Installed packages, the standard library and imports by a computed name are left out.
+
+Of ``LIBRARIES`` the versions are compared. Others are named, but they are no reason to run a trial again:
+most new versions change nothing, or only the rounding.
 """
 
 from __future__ import annotations
@@ -31,6 +34,7 @@ from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.provenance.own_package import digest_of_files, folder_of
+from recrl.orchestrator.provenance.versions import package_versions
 from recrl.orchestrator.spec import TrialSpec
 from recrl.teachers.registry import TEACHERS
 
@@ -41,6 +45,7 @@ SUFFIXES = (".py", ".xml", ".txt")
 MOST_FILES = 1000  # of the user's project, for one plug-in
 PROJECT_FILES = ("pyproject.toml", "setup.py", "setup.cfg", ".git")  # in the folder of a project
 INSTALLED = ("site-packages", "dist-packages")
+LIBRARIES = ("gymnasium", "minigrid", "mujoco", "numba", "numpy", "scipy", "torch")  # that affect results
 KINDS = (
     ("task", "recrl.tasks", TASKS),
     ("agent", "recrl.agents", AGENTS),
@@ -87,10 +92,12 @@ class CodeComparison:
         differs: whether an attempt ran other code; False if unknown.
         missing: the top-level packages and modules that it ran and that are not found now. So it is unknown
             whether their code differs. Empty if other code differs.
+        versions: of libraries in an attempt, where they are others now, such as "torch 2.12.0, now 2.13.0".
     """
 
     differs: bool = False
     missing: frozenset[str] = frozenset()
+    versions: frozenset[str] = frozenset()
 
 
 def compare(
@@ -103,11 +110,34 @@ def compare(
         spec: the trial.
         installed: shared by the trials of one pass; None to read the code for this one.
     """
+    attempts = list(attempts)
     ran = [(name, digest) for attempt in attempts for name, digest in attempt.get("code", {}).items()]
     now = (installed or InstalledCode()).of(spec)
+    versions = _other_versions(attempts)
     if any(name in now and digest != now[name] for name, digest in ran):
-        return CodeComparison(differs=True)
-    return CodeComparison(missing=frozenset(name for name, _ in ran if name not in now))
+        return CodeComparison(differs=True, versions=versions)
+    return CodeComparison(missing=frozenset(name for name, _ in ran if name not in now), versions=versions)
+
+
+def library_versions(attempt: Mapping[str, Any]) -> dict[str, str]:
+    """Return the versions of ``LIBRARIES`` in an attempt, without the build (as in ``2.13.0+cpu``)."""
+    packages = attempt.get("packages")
+    return _without_builds(packages) if isinstance(packages, Mapping) else {}
+
+
+def _without_builds(packages: Mapping[str, Any]) -> dict[str, str]:
+    return {name: str(packages[name]).partition("+")[0] for name in LIBRARIES if name in packages}
+
+
+def _other_versions(attempts: Iterable[Mapping[str, Any]]) -> frozenset[str]:
+    """Return each library's version in an attempt that is not the installed one, with the latter."""
+    now = _without_builds(package_versions(LIBRARIES))
+    return frozenset(
+        f"{name} {ran}, now {now[name]}"
+        for attempt in attempts
+        for name, ran in library_versions(attempt).items()
+        if ran != now.get(name, ran)
+    )
 
 
 def compare_files(
@@ -156,6 +186,22 @@ def missing_modules_sentence(missing: Iterable[Collection[str]]) -> str:
     return (
         f"the code of {counted(len(lacking), 'trial')} was not checked for changes, because the module "
         f"{subject} not found; start the command in the folder that holds {'them' if others else 'it'}"
+    )
+
+
+def other_versions_sentence(versions: Iterable[Collection[str]]) -> str:
+    """Describe trials that ran with other versions of libraries; empty for none.
+
+    Args:
+        versions: ``CodeComparison.versions`` of each trial.
+    """
+    others = [changes for changes in versions if changes]
+    if not others:
+        return ""
+    listed = "; ".join(sorted(set().union(*others)))
+    return (
+        f"{counted(len(others), 'trial')} ran with other versions of libraries than are installed now "
+        f"({listed}); the same settings may give other results"
     )
 
 

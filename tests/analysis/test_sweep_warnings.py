@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import pytest
 
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.data.sweep_warnings import doubts, mixed_code_sentence
+from recrl.analysis.data.sweep_warnings import doubts, mixed_code_sentence, mixed_versions_sentence
 from recrl.analysis.report import drawing
 
 REMEDY = "in a sweep's own folder, launch --rerun-changed makes it that of the installed version"
@@ -62,6 +62,29 @@ def test_code_that_differs_from_that_of_the_baseline_is_named(finished: Sweep) -
 def test_many_cells_are_counted(finished: Sweep) -> None:
     old = {it.spec.title: "old" for it in finished.facts if it.spec.seed == 0}
     assert "and 7 more); in a sweep" in mixed_code_sentence(with_code(finished, old))
+
+
+def test_versions_of_libraries_that_differ_between_seeds_are_one_sentence(finished: Sweep) -> None:
+    facts = []
+    for it in finished.facts:
+        is_older = it.spec.title.startswith("river-a cpo linear seed 1")
+        packages = {"torch": "2.12.0" if is_older else "2.13.0+cpu", "mlflow": it.spec.title}
+        attempt = {"code": {"recrl": "same"}, "packages": packages}
+        facts.append(dataclasses.replace(it, provenance=json.dumps({"attempts": [attempt]})))
+    sweep = dataclasses.replace(finished, facts=tuple(facts))
+    assert mixed_versions_sentence(finished) == ""
+    assert mixed_versions_sentence(sweep) == (
+        "versions of libraries differ between seeds that are averaged (river-a cpo linear): a difference may "
+        "come from them"
+    )
+    assert mixed_versions_sentence(sweep) in doubts(sweep)
+
+
+@pytest.mark.parametrize("packages", [None, [], "text"])
+def test_a_record_of_packages_of_the_wrong_form_is_no_error(finished: Sweep, packages: object) -> None:
+    text = json.dumps({"attempts": [{"code": {}, "packages": packages}]})
+    facts = tuple(dataclasses.replace(it, provenance=text) for it in finished.facts)
+    assert mixed_versions_sentence(dataclasses.replace(finished, facts=facts)) == ""
 
 
 @pytest.mark.parametrize("code", [[], "text", {"recrl": ["a list"]}])

@@ -23,7 +23,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.launch_plan import PlannedAction, TrialSelection, make_plan
-from recrl.orchestrator.provenance import code_changes
+from recrl.orchestrator.provenance import code_changes, versions
 from recrl.orchestrator.provenance.code_changes import (
     CodeComparison,
     code_of,
@@ -31,6 +31,7 @@ from recrl.orchestrator.provenance.code_changes import (
     compare_files,
     missing_modules_sentence,
     other_code_sentence,
+    other_versions_sentence,
 )
 from recrl.orchestrator.ray.tune_callbacks import DriverWatch
 from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_sweep
@@ -405,7 +406,31 @@ def test_a_changed_module_of_the_working_directory_is_found_without_trust(
     assert "my_scaled_task" not in sys.modules
 
 
+def test_other_versions_of_libraries_are_said_where_a_launch_would_mix_them(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    then = {"torch": "2.12.0+cu128", "mujoco": "3.9.0", "numpy": "2.4.6", "ray": "2.50.0"}
+    now = {"torch": "2.13.0+cpu", "mujoco": "4.0.0", "numpy": "2.4.6+local", "ray": "2.60.0"}
+    monkeypatch.setattr(versions, "package_versions", lambda _: then)
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    monkeypatch.setattr(code_changes, "package_versions", lambda _: now)
+    capsys.readouterr()
+    assert main(["plan", "grid.yaml", "--trust"]) == ExitCode.OK
+    assert "versions" not in capsys.readouterr().out  # nothing is to do, so nothing is mixed
+    sentence = (
+        "warning: 1 trial ran with other versions of libraries than are installed now (mujoco 3.9.0, now "
+        "4.0.0; torch 2.12.0, now 2.13.0); the same settings may give other results"
+    )
+    (folder / "grid.yaml").write_text(GRID.replace("SEEDS", "0, 1"))
+    for command in (["plan", "grid.yaml", "--trust"], ["evaluate", "small", "--trust"]):
+        assert main(command) == ExitCode.OK
+        assert sentence in capsys.readouterr().out.splitlines()
+    assert main(["plan", "grid.yaml", "--trust", "--rerun-changed"]) == ExitCode.OK
+    assert "1 complete" in capsys.readouterr().out  # it is no other code
+
+
 def test_the_sentences_count() -> None:
+    assert other_versions_sentence([(), ()]) == ""
     assert other_code_sentence(0, 0) == ""
     assert other_code_sentence(12, 0) == (
         "12 complete trials come from other code than is installed now; launch --rerun-changed runs them "
