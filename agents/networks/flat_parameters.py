@@ -87,7 +87,7 @@ class Adam:
     """Adam on one flat block, with its state in the saved order.
 
     It is PyTorch's functional Adam with the defaults of ``torch.optim.Adam``. That class imports PyTorch's
-    compiler, which takes seconds and memory in every process.
+    compiler, which takes time and memory in every process.
 
     Args:
         parameters: the block to optimise.

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import pandas as pd
@@ -28,7 +29,7 @@ from recrl.orchestrator.spec import TrialStatus
 
 BASELINE = "none"  # of ``metrics.comparisons``
 
-_Codes = Mapping[str, set[str]]  # digests, by the name of the package
+_Codes = Mapping[str, set[str]]  # digests or versions, by the name of the package
 
 
 def damages(sweep: Sweep) -> list[str]:
@@ -59,29 +60,47 @@ def mixed_code_sentence(sweep: Sweep) -> str:
     Returns:
         One sentence; empty if there are no such cells.
     """
-    parts = _mixed_cells(sweep, lambda attempt: attempt["code"])
+    parts = _in_cells(_ran(sweep, lambda attempts: [attempts[-1]["code"]]))
     remedy = "in a sweep's own folder, launch --rerun-changed makes it that of the installed version"
     return f"the code that trials ran differs {parts}; {remedy}" if parts else ""
 
 
 def mixed_versions_sentence(sweep: Sweep) -> str:
-    """Name cells as ``mixed_code_sentence`` does, whose trials ran with different versions of libraries."""
-    parts = _mixed_cells(sweep, library_versions)
-    return f"versions of libraries differ {parts}: a difference may come from them" if parts else ""
+    """Name cells as ``mixed_code_sentence`` does, whose trials ran with different versions of libraries.
+
+    All attempts of a trial count, because each of them learnt a part of its policy.
+    """
+    ran = _ran(sweep, lambda attempts: [library_versions(attempt) for attempt in attempts])
+    parts = _in_cells(ran)
+    if not parts:
+        return ""
+    found: _Codes = functools.reduce(_joined, ran.values(), {})
+    versions = "; ".join(
+        f"{name} {', '.join(sorted(found[name]))}" for name in sorted(found) if len(found[name]) > 1
+    )
+    return f"versions of libraries differ {parts}, so a difference may come from them: {versions}"
 
 
-def _mixed_cells(sweep: Sweep, ran: Callable[[dict[str, Any]], Mapping[str, Any]]) -> str:
-    """Name cells whose trials ran different things; empty if there are none.
+def _ran(
+    sweep: Sweep, of_attempts: Callable[[list[dict[str, Any]]], Iterable[Mapping[str, Any]]]
+) -> dict[tuple[str, str, str], _Codes]:
+    """Return what the trials of each cell ran: by name, all digests or versions.
 
     Args:
         sweep: the sweep.
-        ran: digests or versions by name, of the last attempt of a trial.
+        of_attempts: digests or versions by name, from the attempts of one trial, at least one.
     """
     codes: dict[tuple[str, str, str], _Codes] = {}
     for group, trial in zip(sweep.groups, sweep.facts, strict=True):
-        for last in attempts(trial)[-1:]:
-            of_trial = {name: {str(value)} for name, value in ran(last).items()}
-            codes[group] = _joined(codes.get(group, {}), of_trial)
+        if known := attempts(trial):
+            for found in of_attempts(known):
+                of_trial = {name: {str(value)} for name, value in found.items()}
+                codes[group] = _joined(codes.get(group, {}), of_trial)
+    return codes
+
+
+def _in_cells(codes: Mapping[tuple[str, str, str], _Codes]) -> str:
+    """Name cells whose trials ran different things; empty if there are none."""
     averaged = [group for group, found in codes.items() if _is_mixed(found)]
     compared = []
     for (task, agent, method), found in codes.items():

@@ -93,12 +93,10 @@ def _warn_of_other_code(evaluated: Sequence[SavedTrial], console: Console) -> No
     complete = sum(saved.store.record().status is TrialStatus.COMPLETE for saved in changed)
     if sentence := other_code_sentence(complete, len(changed) - complete):
         say(console, f"warning: {sentence}; these evaluations use the installed code")
-    for sentence in (
-        missing_modules_sentence(code.missing for code in codes),
-        other_versions_sentence(code.versions for code in codes),
-    ):
-        if sentence:
-            say(console, f"warning: {sentence}")
+    if sentence := missing_modules_sentence(code.missing for code in codes):
+        say(console, f"warning: {sentence}")
+    if sentence := other_versions_sentence(code.versions for code in codes):
+        say(console, f"warning: {sentence}; these evaluations use the installed versions")
 
 
 def _film(

@@ -54,11 +54,16 @@ KINDS = (
 
 
 class InstalledCode:
-    """The code that is installed now; each package is read once, for many trials."""
+    """The code that is installed now; each package is read once, for many trials.
+
+    Attributes:
+        libraries: versions of ``LIBRARIES``.
+    """
 
     def __init__(self) -> None:
         self._module_of = functools.cache(_module_of)
         self._digests_of = functools.cache(_digests_of)
+        self.libraries = _without_builds(package_versions(LIBRARIES))
 
     def of(self, spec: TrialSpec) -> dict[str, str]:
         """Return digests of a trial's code: recrl's, and those of the user's top-level packages or modules.
@@ -112,8 +117,9 @@ def compare(
     """
     attempts = list(attempts)
     ran = [(name, digest) for attempt in attempts for name, digest in attempt.get("code", {}).items()]
-    now = (installed or InstalledCode()).of(spec)
-    versions = _other_versions(attempts)
+    installed = installed or InstalledCode()
+    now = installed.of(spec)
+    versions = _other_versions(attempts, installed.libraries)
     if any(name in now and digest != now[name] for name, digest in ran):
         return CodeComparison(differs=True, versions=versions)
     return CodeComparison(missing=frozenset(name for name, _ in ran if name not in now), versions=versions)
@@ -129,9 +135,8 @@ def _without_builds(packages: Mapping[str, Any]) -> dict[str, str]:
     return {name: str(packages[name]).partition("+")[0] for name in LIBRARIES if name in packages}
 
 
-def _other_versions(attempts: Iterable[Mapping[str, Any]]) -> frozenset[str]:
+def _other_versions(attempts: Iterable[Mapping[str, Any]], now: Mapping[str, str]) -> frozenset[str]:
     """Return each library's version in an attempt that is not the installed one, with the latter."""
-    now = _without_builds(package_versions(LIBRARIES))
     return frozenset(
         f"{name} {ran}, now {now[name]}"
         for attempt in attempts

@@ -1,5 +1,8 @@
 """Networks differentiated by hand against PyTorch's automatic differentiation, and Adam against PyTorch's."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -94,6 +97,14 @@ def test_adam_is_pytorchs() -> None:
         expected.step()
         ours.step()
     assert torch.equal(parameters.values, reference.detach())
+
+
+def test_adam_does_not_import_pytorchs_compiler() -> None:
+    code = (
+        "import sys; from recrl.agents.networks.flat_parameters import Adam, FlatParameters; "
+        "Adam(FlatParameters([(2, 3)]), 0.1).step(); sys.exit('torch._dynamo' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @pytest.mark.parametrize("name", INITIALISERS)

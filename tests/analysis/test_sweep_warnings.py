@@ -64,20 +64,37 @@ def test_many_cells_are_counted(finished: Sweep) -> None:
     assert "and 7 more); in a sweep" in mixed_code_sentence(with_code(finished, old))
 
 
+def with_versions(sweep: Sweep, older: str) -> Sweep:
+    """The sweep, had the first attempts of trials run with another torch: by the beginning of their title."""
+    facts = []
+    for it in sweep.facts:
+        then = "2.12.0" if it.spec.title.startswith(older) else "2.13.0+cu128"
+        attempts = [
+            {"code": {"recrl": "same"}, "packages": {"torch": torch, "mlflow": it.spec.title}}
+            for torch in (then, "2.13.0+cpu")
+        ]
+        facts.append(dataclasses.replace(it, provenance=json.dumps({"attempts": attempts})))
+    return dataclasses.replace(sweep, facts=tuple(facts))
+
+
 def test_versions_of_libraries_that_differ_between_seeds_are_one_sentence(finished: Sweep) -> None:
+    sweep = with_versions(finished, "river-a cpo linear seed 1")
+    assert mixed_versions_sentence(finished) == mixed_versions_sentence(with_versions(finished, "none")) == ""
+    assert mixed_versions_sentence(sweep) == (
+        "versions of libraries differ between seeds that are averaged (river-a cpo linear), so a difference "
+        "may come from them: torch 2.12.0, 2.13.0"
+    )
+    assert mixed_versions_sentence(sweep) in drawing.missing(sweep)
+
+
+def test_a_curriculum_that_ran_with_other_versions_than_none_is_named(finished: Sweep) -> None:
     facts = []
     for it in finished.facts:
-        is_older = it.spec.title.startswith("river-a cpo linear seed 1")
-        packages = {"torch": "2.12.0" if is_older else "2.13.0+cpu", "mlflow": it.spec.title}
-        attempt = {"code": {"recrl": "same"}, "packages": packages}
+        torch = "2.12.0" if it.spec.title.startswith("river-a cpo dynamic") else "2.13.0"
+        attempt = {"code": {}, "packages": {"torch": torch}}
         facts.append(dataclasses.replace(it, provenance=json.dumps({"attempts": [attempt]})))
-    sweep = dataclasses.replace(finished, facts=tuple(facts))
-    assert mixed_versions_sentence(finished) == ""
-    assert mixed_versions_sentence(sweep) == (
-        "versions of libraries differ between seeds that are averaged (river-a cpo linear): a difference may "
-        "come from them"
-    )
-    assert mixed_versions_sentence(sweep) in doubts(sweep)
+    sentence = mixed_versions_sentence(dataclasses.replace(finished, facts=tuple(facts)))
+    assert "between none and curricula compared with it (river-a cpo dynamic)" in sentence
 
 
 @pytest.mark.parametrize("packages", [None, [], "text"])

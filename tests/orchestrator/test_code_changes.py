@@ -422,11 +422,15 @@ def test_other_versions_of_libraries_are_said_where_a_launch_would_mix_them(
         "4.0.0; torch 2.12.0, now 2.13.0); the same settings may give other results"
     )
     (folder / "grid.yaml").write_text(GRID.replace("SEEDS", "0, 1"))
-    for command in (["plan", "grid.yaml", "--trust"], ["evaluate", "small", "--trust"]):
-        assert main(command) == ExitCode.OK
-        assert sentence in capsys.readouterr().out.splitlines()
     assert main(["plan", "grid.yaml", "--trust", "--rerun-changed"]) == ExitCode.OK
     assert "1 complete" in capsys.readouterr().out  # it is no other code
+    assert main(["plan", "grid.yaml", "--trust"]) == ExitCode.OK
+    assert sentence in capsys.readouterr().out.splitlines()
+    assert main(["evaluate", "small", "--trust"]) == ExitCode.OK
+    evaluated = f"{sentence}; these evaluations use the installed versions"
+    assert evaluated in capsys.readouterr().out.splitlines()
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    assert sentence in capsys.readouterr().out.splitlines()
 
 
 def test_the_sentences_count() -> None:

@@ -413,7 +413,7 @@ def test_environments_are_closed_and_an_error_of_that_fails_nothing(
     assert len(closed) == 3  # of the training, and of two evaluations
 
 
-@pytest.mark.parametrize(("episodes", "environments"), [(0, 1), (3, 3), (4, 4), (6, 4)])
+@pytest.mark.parametrize(("episodes", "environments"), [(3, 3), (4, 4), (6, 4)])
 def test_an_evaluation_of_few_episodes_makes_no_environment_that_it_does_not_use(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, episodes: int, environments: int
 ) -> None:
