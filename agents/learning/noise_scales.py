@@ -58,14 +58,16 @@ def matching_scale(logits: Floats, weights: Floats, noise: float) -> float:
 def matching_log_std(log_std: Floats, noise: float) -> Floats:
     """Return the log_std that gives each action component the variance of the eps-mixture around the mean.
 
-    sigma'^2 = max(sigma^2, (1 - eps) sigma^2 + eps / 3): 1 / 3 is the variance of a uniform action in half
-    ranges. (The distance between the mean and the middle of the range, which adds to the mixture's variance,
-    is left out: it depends on the observation.)
+    sigma'^2 = max(sigma^2, (1 - eps) sigma^2 + (eps / 3) min(1, 2 / m)): 1 / 3 is the variance of a uniform
+    action in half ranges. With m > 2 components the added noise has the mean squared length that it has with
+    two, as the bound ``min_std``: else a robot with many joints would be disturbed more than a car.
+    (The distance between the mean and the middle of the range, which adds to the mixture's variance, is left
+    out: it depends on the observation.)
 
     Args:
         log_std: of the present policy, in half ranges, [m].
         noise: eps in (0, 1].
     """
     variance = np.exp(2.0 * log_std)
-    mixed = (1.0 - noise) * variance + noise / 3.0
+    mixed = (1.0 - noise) * variance + noise / 3.0 * min(1.0, 2.0 / len(log_std))
     return 0.5 * np.log(np.maximum(variance, mixed))

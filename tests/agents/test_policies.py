@@ -179,6 +179,11 @@ def test_gaussian_noise_gives_the_variance_of_the_mixture() -> None:
     assert np.exp(2.0 * found) == pytest.approx([0.7 * 0.01 + 0.3 / 3.0, 0.7 * 0.04 + 0.3 / 3.0])
 
 
+def test_gaussian_noise_of_many_components_is_as_long_as_that_of_two() -> None:
+    found = matching_log_std(np.full(8, np.log(0.1)), 0.3)
+    assert np.exp(2.0 * found) == pytest.approx(np.full(8, 0.7 * 0.01 + 0.025))  # 8 x 0.025 = 2 x 0.3 / 3
+
+
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("form", ["match-mixture", "temperature"])
 def test_noise_makes_a_policy_more_random(space: Space[object], form: str) -> None:
