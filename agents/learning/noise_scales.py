@@ -59,7 +59,7 @@ def matching_log_std(log_std: Floats, noise: float) -> Floats:
     """Return the log_std that gives each action component the variance of the eps-mixture around the mean.
 
     sigma'^2 = max(sigma^2, (1 - eps) sigma^2 + (eps / 3) min(1, 2 / m)): 1 / 3 is the variance of a uniform
-    action in half ranges. With m > 2 components the added noise has the mean squared length that it has with
+    action in half ranges. With m > 2 components the uniform part has the mean squared length that it has with
     two, as the bound ``min_std``: else a robot with many joints would be disturbed more than a car.
     (The distance between the mean and the middle of the range, which adds to the mixture's variance, is left
     out: it depends on the observation.)
