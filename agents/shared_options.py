@@ -193,8 +193,9 @@ class ActorCriticConfig(Options):
     noise_form: Literal["match-mixture", "temperature"] = Field(
         default="match-mixture",
         description="Meaning of policy noise (ours; the paper does not define it). match-mixture: "
-        "make the policy as random as its mixture with a uniform one. temperature: "
-        "divide logits or multiply standard deviations by 1 / (1 - noise).",
+        "make the policy as random as its mixture with a uniform one; with more than two continuous "
+        "actions, less random than that. temperature: divide logits or multiply standard "
+        "deviations by 1 / (1 - noise).",
     )
     compaction: bool = Field(
         default=True,

@@ -4,7 +4,8 @@ The *parameters* are changed once, and the agent continues on-policy from there.
 policy would have to be part of every later gradient. It would not help a saturated softmax either: its
 gradients are about 1e-8.
 
-``match-mixture`` makes the policy as random as the mixture (1 - eps) pi + eps uniform, never less random.
+``match-mixture`` makes the policy as random as the mixture (1 - eps) pi + eps uniform, never less random. A
+Gaussian policy with more than two action components becomes less random than that (``matching_log_std``).
 ``temperature`` divides the logits by 1 / (1 - eps), or multiplies the standard deviations by it.
 
 Notation: U distinct observations, A actions, m action components, eps = eps_pi.
@@ -56,7 +57,7 @@ def matching_scale(logits: Floats, weights: Floats, noise: float) -> float:
 
 
 def matching_log_std(log_std: Floats, noise: float) -> Floats:
-    """Return the log_std that gives each action component the variance of the eps-mixture around the mean.
+    """Return the log_std for the variance of the eps-mixture around the mean, in each action component.
 
     sigma'^2 = max(sigma^2, (1 - eps) sigma^2 + (eps / 3) min(1, 2 / m)): 1 / 3 is the variance of a uniform
     action in half ranges. With m > 2 components the uniform part has the mean squared length that it has with

@@ -29,7 +29,7 @@ from recrl.orchestrator.spec import TrialStatus
 
 BASELINE = "none"  # of ``metrics.comparisons``
 
-_Codes = Mapping[str, set[str]]  # digests or versions, by the name of the package
+_Ran = Mapping[str, set[str]]  # digests of code, or versions, by the name of the package
 
 
 def damages(sweep: Sweep) -> list[str]:
@@ -38,7 +38,7 @@ def damages(sweep: Sweep) -> list[str]:
 
 
 def doubts(sweep: Sweep) -> list[str]:
-    """Return sentences on changed, missing and mixed code, and on ineffective curricula."""
+    """Return sentences on changed, missing and mixed code, mixed libraries, and ineffective curricula."""
     installed = InstalledCode()
     codes = [compare(attempts(it), it.spec, installed) for it in sweep.facts]
     changed = [it for it, code in zip(sweep.facts, codes, strict=True) if code.differs]
@@ -60,9 +60,9 @@ def mixed_code_sentence(sweep: Sweep) -> str:
     Returns:
         One sentence; empty if there are no such cells.
     """
-    parts = _in_cells(_ran(sweep, lambda attempts: [attempts[-1]["code"]]))
+    where = _where_different(_ran_by_cell(sweep, lambda known: [known[-1]["code"]]))
     remedy = "in a sweep's own folder, launch --rerun-changed makes it that of the installed version"
-    return f"the code that trials ran differs {parts}; {remedy}" if parts else ""
+    return f"the code that trials ran differs {where}; {remedy}" if where else ""
 
 
 def mixed_versions_sentence(sweep: Sweep) -> str:
@@ -70,41 +70,39 @@ def mixed_versions_sentence(sweep: Sweep) -> str:
 
     All attempts of a trial count, because each of them learnt a part of its policy.
     """
-    ran = _ran(sweep, lambda attempts: [library_versions(attempt) for attempt in attempts])
-    parts = _in_cells(ran)
-    if not parts:
+    ran = _ran_by_cell(sweep, lambda known: map(library_versions, known))
+    where = _where_different(ran)
+    if not where:
         return ""
-    found: _Codes = functools.reduce(_joined, ran.values(), {})
-    versions = "; ".join(
-        f"{name} {', '.join(sorted(found[name]))}" for name in sorted(found) if len(found[name]) > 1
-    )
-    return f"versions of libraries differ {parts}, so a difference may come from them: {versions}"
+    found: _Ran = functools.reduce(_joined, ran.values(), {})
+    different = [f"{name} {', '.join(sorted(of))}" for name, of in sorted(found.items()) if len(of) > 1]
+    return f"versions of libraries differ {where}, so a difference may come from them: {'; '.join(different)}"
 
 
-def _ran(
+def _ran_by_cell(
     sweep: Sweep, of_attempts: Callable[[list[dict[str, Any]]], Iterable[Mapping[str, Any]]]
-) -> dict[tuple[str, str, str], _Codes]:
+) -> dict[tuple[str, str, str], _Ran]:
     """Return what the trials of each cell ran: by name, all digests or versions.
 
     Args:
         sweep: the sweep.
         of_attempts: digests or versions by name, from the attempts of one trial, at least one.
     """
-    codes: dict[tuple[str, str, str], _Codes] = {}
+    cells: dict[tuple[str, str, str], _Ran] = {}
     for group, trial in zip(sweep.groups, sweep.facts, strict=True):
         if known := attempts(trial):
             for found in of_attempts(known):
                 of_trial = {name: {str(value)} for name, value in found.items()}
-                codes[group] = _joined(codes.get(group, {}), of_trial)
-    return codes
+                cells[group] = _joined(cells.get(group, {}), of_trial)
+    return cells
 
 
-def _in_cells(codes: Mapping[tuple[str, str, str], _Codes]) -> str:
+def _where_different(cells: Mapping[tuple[str, str, str], _Ran]) -> str:
     """Name cells whose trials ran different things; empty if there are none."""
-    averaged = [group for group, found in codes.items() if _is_mixed(found)]
+    averaged = [group for group, found in cells.items() if _is_mixed(found)]
     compared = []
-    for (task, agent, method), found in codes.items():
-        baseline = codes.get((task, agent, BASELINE), {})
+    for (task, agent, method), found in cells.items():
+        baseline = cells.get((task, agent, BASELINE), {})
         if not _is_mixed(found) and not _is_mixed(baseline) and _is_mixed(_joined(found, baseline)):
             compared.append((task, agent, method))
     parts = [
@@ -114,12 +112,12 @@ def _in_cells(codes: Mapping[tuple[str, str, str], _Codes]) -> str:
     return " and ".join(parts)
 
 
-def _joined(one: _Codes, other: _Codes) -> _Codes:
+def _joined(one: _Ran, other: _Ran) -> _Ran:
     return {name: one.get(name, set()) | other.get(name, set()) for name in {**one, **other}}
 
 
-def _is_mixed(codes: _Codes) -> bool:
-    return any(len(digests) > 1 for digests in codes.values())
+def _is_mixed(ran: _Ran) -> bool:
+    return any(len(values) > 1 for values in ran.values())
 
 
 def _cells(groups: Sequence[tuple[str, str, str]]) -> str:

@@ -131,20 +131,6 @@ def library_versions(attempt: Mapping[str, Any]) -> dict[str, str]:
     return _without_builds(packages) if isinstance(packages, Mapping) else {}
 
 
-def _without_builds(packages: Mapping[str, Any]) -> dict[str, str]:
-    return {name: str(packages[name]).partition("+")[0] for name in LIBRARIES if name in packages}
-
-
-def _other_versions(attempts: Iterable[Mapping[str, Any]], now: Mapping[str, str]) -> frozenset[str]:
-    """Return each library's version in an attempt that is not the installed one, with the latter."""
-    return frozenset(
-        f"{name} {ran}, now {now[name]}"
-        for attempt in attempts
-        for name, ran in library_versions(attempt).items()
-        if ran != now.get(name, ran)
-    )
-
-
 def compare_files(
     trial: TrialStore, spec: TrialSpec, installed: InstalledCode | None = None
 ) -> CodeComparison:
@@ -207,6 +193,20 @@ def other_versions_sentence(versions: Iterable[Collection[str]]) -> str:
     return (
         f"{counted(len(others), 'trial')} ran with other versions of libraries than are installed now "
         f"({listed}); the same settings may give other results"
+    )
+
+
+def _without_builds(packages: Mapping[str, Any]) -> dict[str, str]:
+    return {name: str(packages[name]).partition("+")[0] for name in LIBRARIES if name in packages}
+
+
+def _other_versions(attempts: Iterable[Mapping[str, Any]], now: Mapping[str, str]) -> frozenset[str]:
+    """Return each library's version in an attempt that is not the installed one, with the latter."""
+    return frozenset(
+        f"{name} {ran}, now {now[name]}"
+        for attempt in attempts
+        for name, ran in library_versions(attempt).items()
+        if ran != now.get(name, ran)
     )
 
 

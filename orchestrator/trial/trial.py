@@ -333,8 +333,8 @@ def evaluation_rows(
         actor: chooses the actions.
         spec: the trial.
         policies: stochastic, deterministic or both, each evaluated on the same environment stream.
-        num_episodes: of each, at least 0. Fewer than the trial's environments run in as many environments
-            as there are episodes, so that none steps in vain.
+        num_episodes: of each, at least 0. If they are fewer than the trial's environments, only as many
+            environments are made as there are episodes.
         seed: of the environments and of the policy's randomness.
         should_stop: called between steps; once true, ``StoppedError`` is raised.
     """
