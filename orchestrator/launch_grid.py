@@ -284,7 +284,8 @@ def _film(
     """Film complete trials without a video, if the grid requests it."""
     seeds = {"none": (), "first-seed": grid.seeds[:1], "all": grid.seeds}[grid.run.videos]
     complete = [trial.spec for trial in after.with_status(DisplayStatus.COMPLETE) if trial.spec.seed in seeds]
-    unseen = [store.trial(spec) for spec in complete if not any(store.trial(spec).videos_folder.glob("*"))]
+    trials = map(store.trial, complete)
+    unseen = [trial for trial in trials if not any(trial.videos_folder.glob("update-*"))]
     if not unseen:
         return
     from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415

@@ -21,6 +21,7 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import IN_FORCE_COLOUR, TEXT_WIDTH, MethodStyle
 from recrl.analysis.statistics.cumulative_cost import policies_of, training_runs
+from recrl.analysis.statistics.metrics import with_finished_training
 from recrl.environments.cmdp import Floats
 
 # Colour, dashes and name of every sum except the measured one.
@@ -44,11 +45,8 @@ def cumulative_bounds(sweep: Sweep, agent: str, *, cost: int = 0) -> Figure | No
         The figure, with runs as thin lines and their mean as a thick one; or None if no trial of the agent
         has finished its training phase.
     """
-    trials = sweep.trials[
-        (sweep.trials["agent"] == agent)
-        & (sweep.trials["env_steps"] >= sweep.trials["boundary_step"])
-        & sweep.trials[f"deploy_limit_{cost}"].notna()
-    ]
+    trials = with_finished_training(sweep)
+    trials = trials[(trials["agent"] == agent) & trials[f"deploy_limit_{cost}"].notna()]
     if not len(trials):
         return None
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))

@@ -146,6 +146,12 @@ def save(figure: Figure, folder: Path, stem: str) -> list[Path]:
     return [pdf, png]
 
 
+def remove(folder: Path, stem: str) -> None:
+    """Remove the files of ``save``, if they are there."""
+    for suffix in (".pdf", ".png"):
+        (folder / f"{stem}{suffix}").unlink(missing_ok=True)
+
+
 def save_png(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG; equal figures give equal bytes.
 

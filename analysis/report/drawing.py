@@ -157,6 +157,7 @@ def _draw(
     for stem, drawing in figures.items():
         with mistakes.kept(stem):
             if (figure := drawing.make()) is None:
+                styles.remove(folder, stem)  # of an earlier grid
                 continue
             if unfinished:
                 drawn.append(styles.save_png(figure, folder / f"{stem}.png"))

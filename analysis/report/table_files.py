@@ -59,6 +59,7 @@ COMPARED_CLAIMS_NOTE = (
     "curriculum's mean, where that is above 0 beyond its interval. Feasible pairs: seeds whose two final "
     "policies are feasible. The paper's gains are at the end of the training phase."
 )
+OTHER_TABLES = ("claims.csv", "verdicts.csv", "summary.csv", "comparisons.csv", "outcomes.tex")
 FAILED_CLAIMS_NOTE = "In a seed with a failed trial a claim does not hold."
 FAILED_NOTE = (
     "A failed trial counts as neither feasible nor solved; the means are over the n complete trials."
@@ -115,6 +116,7 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
         table_formats.write_csv(pd.concat(bounds), folder / "bounds.csv"),
     ]
     if not len(rows):
+        _remove_earlier(folder, written)
         return written, Tables()
     generator = np.random.default_rng(BOOTSTRAP_SEED)
     averaged = metrics.summary(rows, sweep.trials)
@@ -139,7 +141,14 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
         table_formats.write_csv(compared, folder / "comparisons.csv"),
         table_formats.write_text("\n".join(latex), folder / "outcomes.tex"),
     ]
+    _remove_earlier(folder, written)
     return written, Tables(judged, shown)
+
+
+def _remove_earlier(folder: Path, written: Sequence[Path]) -> None:
+    """Remove tables of an earlier grid that were not written again: they can always be computed."""
+    for name in {OUTCOMES_FILE, *OTHER_TABLES} - {path.name for path in written}:
+        (folder / name).unlink(missing_ok=True)
 
 
 def write_outcomes(sweep: Sweep, folder: Path) -> list[Path]:

@@ -56,6 +56,7 @@ import pandas as pd
 from recrl.analysis.data.exact_values import finite_model
 from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.statistics.metrics import with_finished_training
 from recrl.environments.cmdp import Floats, Phase
 from recrl.orchestrator.errors import RecrlError
 from recrl.teachers.bounds import (
@@ -148,7 +149,7 @@ def cumulative_costs(sweep: Sweep, *, cost: int | Mapping[str, int] = 0) -> pd.D
         curriculum), deploy_limit, and the quantities in the module's docstring; NaN if unknown, bounds also
         for agents other than CPO.
     """
-    trained = sweep.trials[sweep.trials["env_steps"] >= sweep.trials["boundary_step"]]
+    trained = with_finished_training(sweep)
     runs = training_runs(sweep)
     lines = []
     for _, trial in trained.iterrows():
@@ -196,6 +197,8 @@ def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.
         if (curriculum := names[str(group[2])]) not in DECAYS:
             continue
         policies, episodes = int(runs["policies"].iloc[0]), float(runs["episodes_per_policy"].mean())
+        if not episodes:  # no episode finished in the training phase
+            continue
         overshoot = float((runs["overshoot_sum"] / runs["policies"]).max())
         deploy = float(runs["deploy_limit"].iloc[0])
         allowed = policies * deploy + budget / episodes

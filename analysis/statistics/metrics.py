@@ -79,6 +79,16 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
     return rows.drop(columns="_order")
 
 
+def with_finished_training(sweep: Sweep) -> pd.DataFrame:
+    """Return the rows of ``sweep.trials`` whose saved updates reach the end of the training phase.
+
+    The progress ``env_steps`` may be ahead of them, in a trial that runs or has failed.
+    """
+    reached = sweep.updates.groupby(list(KEY), observed=True)["end_step"].max().rename("_reached")
+    trials = sweep.trials.join(reached, on=list(KEY))
+    return sweep.trials[(trials["_reached"] >= trials["boundary_step"]).to_numpy()]
+
+
 def training_totals(sweep: Sweep) -> pd.DataFrame:
     """Return the cost of relaxed training: one row per trial with a finished training phase.
 
@@ -88,7 +98,7 @@ def training_totals(sweep: Sweep) -> pd.DataFrame:
         which an episode ended, so that there is a mean cost); updates_over_i (such updates with a mean cost
         above the limit in force).
     """
-    trained = sweep.trials[sweep.trials["env_steps"] >= sweep.trials["boundary_step"]]
+    trained = with_finished_training(sweep)
     phases = sweep.phases[sweep.phases["phase"] == Phase.TRAINING.value]
     totals = [f"{kind}_{i}_total" for i in range(sweep.num_costs) for kind in ("cost", "excess")]
     rows = phases[[*KEY, "episodes", "steps", *totals]].merge(trained[list(KEY)], on=list(KEY))

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from recrl.orchestrator.cli.output import say, short, show
 from recrl.orchestrator.cli.requests import EvaluateRequest
-from recrl.orchestrator.cli.sweeps import open_store
+from recrl.orchestrator.cli.sweeps import command_line, open_store
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -129,7 +129,7 @@ def _chosen(store: SweepStore, request: EvaluateRequest) -> list[TrialStore]:
     kept = {spec.folder_name for spec in select(specs, only)} | (set() if only else damaged)
     if not kept:
         begin = f" begin with {text!r}" if text else ""
-        raise RecrlError(f"{store.name}: no trials on disk{begin}; see recrl-sweep status {store.name}")
+        raise RecrlError(f"{store.name}: no trials on disk{begin}; see {command_line('status', store)}")
     return [trial for trial in found if trial.folder.name in kept]
 
 
@@ -140,4 +140,5 @@ def _tell_mlflow(store: SweepStore, request: EvaluateRequest, console: Console) 
         return
     report = sync(store, uri, write_export=write_in_own_process)
     if not report.is_up_to_date:
-        say(console, f"MLflow     is not up to date ({report.problem}); later: recrl-sweep sync {store.name}")
+        later = command_line("sync", store, request.tracking_uri)
+        say(console, f"MLflow     is not up to date ({report.problem}); later: {later}")

@@ -15,11 +15,11 @@ from recrl.orchestrator.cli.output import say, short, show
 from recrl.orchestrator.cli.plan import say_other_code, say_plan, selection_of
 from recrl.orchestrator.cli.requests import LaunchRequest
 from recrl.orchestrator.cli.status import say_failures
+from recrl.orchestrator.cli.sweeps import command_line
 from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 def run_launch(request: LaunchRequest, console: Console) -> ExitCode:
     """Run the incomplete trials of a grid file."""
+    if request.tracking_uri and not request.mlflow:
+        raise RecrlError("--no-mlflow, --tracking-uri: give one of them")
     grid = read_grid(request.grid)
     options = LaunchOptions(
         root=request.root,
@@ -119,8 +121,7 @@ class _Printer(LaunchListener):
         """Print the error, and how to see its traceback."""
         reason = f"({type(error).__name__}: {error}), because of a bug in recrl"
         say(self._console, f"Figures    not all are drawn {reason}")
-        place = shlex.join([self._grid.name, *_root_of(self._options)])
-        say(self._console, f"           for its traceback: recrl-sweep figures {place}")
+        say(self._console, f"           for its traceback: {command_line('figures', self._store)}")
 
     def filming(self, trials: Sequence[TrialStore]) -> None:
         """Print the place of the videos."""
@@ -147,24 +148,16 @@ def _say_results(sweep: Sweep, console: Console) -> None:
         say(console, "")
 
 
-def _root_of(options: LaunchOptions) -> list[str]:
-    """Return the arguments that name the folder of all sweeps, unless it is the default."""
-    return [] if options.root == Path(DEFAULT_ROOT) else ["--root", str(options.root)]
-
-
 def _say_synced(outcome: LaunchOutcome, uri: str, options: LaunchOptions, console: Console) -> None:
     """Print the address of the sweep in MLflow, the command to open it, and whether it is up to date."""
     store = outcome.place.store
-    place = [store.name, *_root_of(options)]
-    if options.tracking_uri:
-        place += ["--tracking-uri", redacted(options.tracking_uri)]
     where = redacted(uri) if options.tracking_uri else short(store.mlflow_database)
     say(console, f"MLflow     {where}")
-    say(console, f"           {shlex.join(['recrl-sweep', 'ui', *place])}")
+    say(console, f"           {command_line('ui', store, options.tracking_uri)}")
     if not outcome.result.synced:  # a sync that was killed leaves the report of an earlier pass
         report = last_report(store, uri)
         problem = f" ({report.problem})" if report and report.problem else ""
-        again = shlex.join(["recrl-sweep", "sync", *place])
+        again = command_line("sync", store, options.tracking_uri)
         say(console, f"           MLflow is not up to date{problem}; nothing is lost: {again}")
 
 

@@ -86,13 +86,19 @@ def source(request: SourceRequest) -> tuple[Sweep, Path]:
     from recrl.analysis.data import export, from_mlflow, sweep_data  # noqa: PLC0415  (imports pandas and SciPy)
 
     given: str | None = request.sweep
-    if request.tracking_uri is not None and request.storage is not None:
-        raise RecrlError("--tracking-uri, --storage: give one of them, the place to read the sweep from")
+    is_file = bool(given and given.endswith(export.SUFFIX))
+    places = {
+        str(given): is_file,
+        "--tracking-uri": request.tracking_uri is not None,
+        "--storage": request.storage is not None,
+    }
+    if len(chosen := [place for place, is_given in places.items() if is_given]) > 1:
+        raise RecrlError(f"{', '.join(chosen)}: give one of them, the place to read the sweep from")
     if request.tracking_uri is not None:
         name = read_name(Path(given)) if given and given.endswith((".yaml", ".yml")) else given
         sweep = from_mlflow.load(checked_uri(request.tracking_uri), name)
         return sweep, Path(f"{sweep.name}-figures")
-    if given and given.endswith(export.SUFFIX):
+    if given and is_file:
         return export.load(Path(given)), Path(f"{Path(given).stem}-figures")
     store = open_store(request)
     return sweep_data.load(store), store.figures_folder

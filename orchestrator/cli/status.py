@@ -12,7 +12,7 @@ from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import print_table, say, short
 from recrl.orchestrator.cli.plan import say_other_code
 from recrl.orchestrator.cli.requests import CheckRequest, LogsRequest, StatusRequest, StopRequest
-from recrl.orchestrator.cli.sweeps import open_place, open_store
+from recrl.orchestrator.cli.sweeps import command_line, open_place, open_store
 from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
@@ -188,7 +188,7 @@ def _trial(store: SweepStore, text: str) -> TrialStore:
     titles = [f"{trial.trial_id} {trial.title}" for trial in found[:10]]
     more = f" and {len(found) - 10} more" if len(found) > 10 else ""
     named = f"give one, by its id or title: {', '.join(titles)}{more}"
-    which = named if found else f"see recrl-sweep status {store.name}"
+    which = named if found else f"see {command_line('status', store)}"
     what = f"trials on disk begin with {text!r}" if text else "trials are running"
     raise RecrlError(f"{store.name}: {len(found) or 'no'} {what}; {which}")
 

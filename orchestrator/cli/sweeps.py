@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
+from pathlib import Path
+
 from recrl.orchestrator.cli.requests import SweepRequest
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 from recrl.orchestrator.find_sweep import find_sweep
+from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.sweep_place import SweepPlace
 
@@ -20,3 +25,20 @@ def open_place(request: SweepRequest, *, checkpoints: bool = False) -> SweepPlac
 def open_store(request: SweepRequest, *, checkpoints: bool = False) -> SweepStore:
     """Return the folder of ``open_place``."""
     return open_place(request, checkpoints=checkpoints).store
+
+
+def command_line(command: str, store: SweepStore, tracking_uri: str | None = None) -> str:
+    """Return a command about a sweep, for a hint: it can be pasted into the same terminal.
+
+    Args:
+        command: for example ``sync``.
+        store: the sweep.
+        tracking_uri: as given by the user; None for the default.
+    """
+    words = ["recrl-sweep", command, store.name]
+    root = store.folder.parent
+    if root.resolve() != Path(DEFAULT_ROOT).resolve():
+        words += ["--root", str(root)]
+    if tracking_uri:
+        words += ["--tracking-uri", redacted(tracking_uri)]
+    return shlex.join(words)

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from recrl.orchestrator.errors import DamagedError, RowError, StorageError
-from recrl.orchestrator.files.atomic_files import write_atomically
 
 PIECE_BYTES = 2**20
 NO_FILE = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
@@ -173,11 +172,6 @@ def rows_text(rows: Sequence[Mapping[str, Any]]) -> bytes:
         if row.keys() != set(names):
             raise RowError(f"{_difference(row.keys(), names)} in one of the rows")
     return "".join([csv_line(names), *(csv_line([row[name] for name in names]) for row in rows)]).encode()
-
-
-def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a CSV file atomically: at least one row, all with the same keys."""
-    write_atomically(path, rows_text(rows))
 
 
 def csv_line(values: Iterable[Any]) -> str:

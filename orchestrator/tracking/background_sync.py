@@ -19,7 +19,7 @@ from pathlib import Path
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.redaction import RedactedStream
 from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
-from recrl.orchestrator.tracking.client import MLFLOW_SETTINGS
+from recrl.orchestrator.tracking.client import MLFLOW_SETTINGS, one_line
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.mlflow_sync import SyncReport, Tracker
 from recrl.orchestrator.tracking.positions import sync_folder
@@ -104,7 +104,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _pass(tracker: Tracker, *, live: bool) -> SyncReport:
-    report = tracker.bring_up_to_date(live=live)
+    try:
+        report = tracker.bring_up_to_date(live=live)
+    except OSError as error:  # a full disk, for example: the next pass may succeed
+        report = SyncReport(problem=one_line(error))
     if report.problem:
         print(f"{time.strftime('%F %T')} {report.problem}", flush=True)
     return report

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import quote, unquote
 
 from recrl.orchestrator.errors import TrackingError, described
+from recrl.orchestrator.files.locks import locked
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.redaction import redacted
 
@@ -114,7 +115,7 @@ def connect(uri: str, *, settings: Mapping[str, str] = MLFLOW_SETTINGS) -> Mlflo
 
 
 def _make_database(path: Path) -> None:
-    """Create MLflow's tables in a temporary file, then rename it.
+    """Create MLflow's tables in a temporary file, then rename it, unless another process was quicker.
 
     MLflow creates them by fifty migrations, not in one transaction: a kill in between would leave an unusable
     database.
@@ -125,7 +126,11 @@ def _make_database(path: Path) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     temporary.unlink(missing_ok=True)
     MlflowClient(_sqlite_uri(temporary)).search_experiments(max_results=1)
-    temporary.replace(path)
+    with locked(path.with_name(f".{path.name}.lock")):
+        if path.exists():  # another launch made it meanwhile, and may have written to it
+            temporary.unlink()
+        else:
+            temporary.replace(path)
 
 
 def _is_sqlite(path: Path) -> bool:

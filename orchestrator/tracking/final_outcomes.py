@@ -184,7 +184,8 @@ def verdict_lines(
         verdicts = _verdicts(seeds, states[group])
         cells = (verdicts, _listed(costs, digits=3), _listed(seeds[0].limits if seeds else ()))
         earned = _text(_mean([it.episode_return for it in seeds])) if seeds else ""
-        lines.append("| " + " | ".join([*group, *cells, earned, str(len(seeds))]) + " |")
+        labels = [label.replace("|", r"\|") for label in group]
+        lines.append("| " + " | ".join([*labels, *cells, earned, str(len(seeds))]) + " |")
     return lines
 
 
@@ -208,7 +209,8 @@ def _verdicts(seeds: Sequence[FinalOutcome], states: Sequence[TrialStatus]) -> s
 
 
 def _outcome(row: Mapping[str, str]) -> FinalOutcome:
-    costs = sorted(name for name in row if re.fullmatch(r"cost_\d+", name) and row[name])
+    names = (name for name in row if re.fullmatch(r"cost_\d+", name) and row[name])
+    costs = sorted(names, key=lambda name: int(name.removeprefix("cost_")))
     return FinalOutcome(
         trial_id=row["trial_id"],
         group=(row["task"], row["agent"], row["method"]),

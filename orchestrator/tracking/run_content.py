@@ -248,7 +248,8 @@ def note(
             _mean_text([values[f"summary/{value}"] for values in trials if f"summary/{value}" in values])
             for value in names
         ]
-        line = "| " + " | ".join([*group, str(len(trials)), *means]) + " |"
+        labels = [label.replace("|", r"\|") for label in group]
+        line = "| " + " | ".join([*labels, str(len(trials)), *means]) + " |"
         if sum(map(len, lines)) + len(lines) + len(line) > MAX_NOTE:
             lines += ["", "More groups than fit here: see the table figure."]
             break

@@ -64,7 +64,7 @@ class SweepSync:
         records = {spec.folder_name: shown_record(self._store.trial(spec)) for spec in specs}
         position = self._show_state(self._position, specs, records, live=live)
         position = self._runs.send_files(position, [self._store.grid_path, self._store.info_path])
-        figures = sorted(self._store.figures_folder.glob("*"))
+        figures = sorted(self._store.figures_folder.glob("[!.]*"))  # no temporary files
         position = self._runs.send_files(position, figures, "figures")
         self._save(position)
         if self._export is None:

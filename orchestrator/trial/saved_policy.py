@@ -27,7 +27,8 @@ from recrl.environments.cmdp import CMDPSpec
 from recrl.environments.plugins import UntrustedNameError
 from recrl.environments.registry import NotDrawnError, make_drawn
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
-from recrl.orchestrator.files.row_files import write_rows
+from recrl.orchestrator.files.atomic_files import write_atomically
+from recrl.orchestrator.files.row_files import rows_text
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.trial import TrialSeeds, evaluation_rows, open_environments
@@ -95,6 +96,8 @@ class SavedTrial:
     ) -> tuple[pd.DataFrame, Path]:
         """Evaluate the policy for whole episodes; return one row per episode, and the file with them.
 
+        An earlier evaluation of the same update and seed is kept in the trial's ``aside/``, if it differs.
+
         Args:
             policies: stochastic, deterministic or both; at least one.
             num_episodes: for each, at least 1.
@@ -108,7 +111,10 @@ class SavedTrial:
             raise RecrlError(f"{self.spec.title}: cannot be evaluated: {described(error)}") from error
         path = self.store.evaluations_folder / f"{self._file_name(seed)}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_rows(path, rows)
+        text = rows_text(rows)
+        if path.exists() and path.read_bytes() != text:  # of another number of episodes, or other policies
+            self.store.move_aside(path)
+        write_atomically(path, text)
         return pd.DataFrame(rows), path
 
     def film(self, policy: FrozenPolicy, video_format: VideoFormat, *, seed: int | None) -> Path:

@@ -13,6 +13,7 @@ from recrl.analysis.figures.cumulative_cost import cumulative_bounds
 from recrl.analysis.report.drawing import drawings
 from recrl.analysis.report.text_tables import admissible_table, bound_table
 from recrl.analysis.statistics import cumulative_cost
+from recrl.analysis.statistics.metrics import training_totals
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError
@@ -75,7 +76,28 @@ def three_policies(finished: Sweep) -> Sweep:
     updates = updates.assign(
         cost_0=[30.0, 6.0, 2.0], limit_0=[20.0, 10.0, math.inf], kl=[0.0, 0.02, 0.0], episodes=[4, 4, 4]
     )
+    trials = trials.assign(boundary_step=updates["end_step"].iloc[-1])
     return dataclasses.replace(finished, trials=trials, updates=updates)
+
+
+def test_a_trial_whose_saved_updates_end_before_the_boundary_is_left_out(finished: Sweep) -> None:
+    sweep = three_policies(finished)
+    updates = sweep.updates.iloc[:2]  # its progress, env_steps, is beyond: it died before it saved more
+    shorter = dataclasses.replace(sweep, updates=updates)
+    assert shorter.trials["env_steps"].item() > updates["end_step"].max()
+    assert not len(cumulative_cost.cumulative_costs(shorter))
+    assert not len(training_totals(shorter))
+    assert cumulative_bounds(shorter, "cpo") is None
+    none = dataclasses.replace(sweep, updates=sweep.updates.iloc[:0])
+    assert not len(cumulative_cost.cumulative_costs(none))
+    assert not len(training_totals(none))
+
+
+def test_without_finished_episodes_no_limit_is_estimated(finished: Sweep) -> None:
+    sweep = three_policies(finished)
+    sweep = dataclasses.replace(sweep, updates=sweep.updates.assign(episodes=0))
+    rows = cumulative_cost.cumulative_costs(sweep)
+    assert not len(cumulative_cost.admissible_limits(rows, sweep, budget=80.0))
 
 
 def test_sums_are_those_counted_by_hand(finished: Sweep) -> None:

@@ -161,6 +161,19 @@ def test_a_report_of_failed_trials_alone_says_so(finished: Sweep, tmp_path: Path
         assert "No verdict: all 36 trials failed." in (tmp_path / name).read_text()
 
 
+def test_no_table_or_figure_of_an_earlier_grid_stays_beside_a_new_report(
+    finished: Sweep, tmp_path: Path
+) -> None:
+    stale = ("outcomes.csv", "summary.csv", "verdicts.csv", "comparisons.csv", "claims.csv", "outcomes.tex")
+    for name in (*stale, "return-against-cost.png", "mine.csv"):
+        (tmp_path / name).write_text("old")
+    running = dataclasses.replace(finished, trials=finished.trials.assign(status="running"))
+    drawing.sketch(running, tmp_path)
+    assert [name for name in stale if (tmp_path / name).exists()] == []
+    assert not (tmp_path / "return-against-cost.png").exists()
+    assert (tmp_path / "mine.csv").read_text() == "old"
+
+
 def test_nothing_to_draw_is_one_clear_sentence(tmp_path: Path) -> None:
     store = SweepStore(tmp_path, "empty")
     with pytest.raises(NothingToDrawError) as caught:

@@ -23,6 +23,7 @@ from recrl.orchestrator.cli import display, status
 from recrl.orchestrator.cli.argument_fields import Request
 from recrl.orchestrator.cli.arguments import COMMANDS, parse
 from recrl.orchestrator.cli.main import main
+from recrl.orchestrator.cli.sweeps import command_line
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -569,6 +570,14 @@ def test_an_option_that_would_be_ignored_is_refused(
             ["export", "small", "--tracking-uri", "sqlite:///x.db", "--storage", "memory://x"],
             "--tracking-uri, --storage: give one of them, the place to read the sweep from",
         ),
+        (
+            ["figures", "small.zip", "--storage", "memory://x"],
+            "small.zip, --storage: give one of them, the place to read the sweep from",
+        ),
+        (
+            ["launch", "grid.yaml", *INLINE[:2], "--no-mlflow", "--tracking-uri", "sqlite:///x.db"],
+            "--no-mlflow, --tracking-uri: give one of them",
+        ),
     ],
 )
 def test_options_that_exclude_each_other_start_nothing(
@@ -577,6 +586,15 @@ def test_options_that_exclude_each_other_start_nothing(
     assert main(arguments) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err == f"recrl-sweep: {sentence}\n"
     assert not (folder / "runs").exists()
+
+
+def test_a_hint_is_a_command_that_finds_the_sweep_and_the_server(folder: Path) -> None:
+    assert command_line("status", SweepStore(Path("runs"), "small")) == "recrl-sweep status small"
+    assert command_line("status", SweepStore(folder / "runs", "small")) == "recrl-sweep status small"
+    elsewhere = SweepStore(Path("/data/all runs"), "small")
+    assert command_line("sync", elsewhere, "http://m:5000") == (
+        "recrl-sweep sync small --root '/data/all runs' --tracking-uri http://m:5000"
+    )
 
 
 @pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE, errno.EPERM])

@@ -100,6 +100,17 @@ def test_a_complete_trials_evaluation_comes_out_again(complete: TrialStore) -> N
     assert contents(complete) == before
 
 
+def test_a_smaller_evaluation_does_not_replace_a_larger_one(complete: TrialStore) -> None:
+    saved = SavedTrial.load(complete)
+    _, path = saved.evaluate(BOTH, num_episodes=20, seed=7)
+    larger = path.read_bytes()
+    saved.evaluate(BOTH, num_episodes=20, seed=7)
+    assert not complete.aside_folder.exists()  # the same again
+    saved.evaluate(BOTH[:1], num_episodes=4, seed=7)
+    assert len(path.read_bytes()) < len(larger)
+    assert [kept.read_bytes() for kept in complete.aside_folder.iterdir()] == [larger]
+
+
 def test_another_seed_gives_other_episodes_and_the_same_seed_the_same(complete: TrialStore) -> None:
     saved = SavedTrial.load(complete)
     once, path = saved.evaluate(BOTH[:1], num_episodes=20, seed=7)

@@ -30,11 +30,11 @@ from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.process_scope import process_scope
 from recrl.orchestrator.spec import TrialStatus
-from recrl.orchestrator.tracking import mlflow_sync
+from recrl.orchestrator.tracking import background_sync, client, mlflow_sync
 from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.tracking.chart_view import view_tag
 from recrl.orchestrator.tracking.client import sqlite_path, tracking_uri
-from recrl.orchestrator.tracking.final_outcomes import FinalOutcome, FinalOutcomes, verdict_lines
+from recrl.orchestrator.tracking.final_outcomes import FinalOutcome, FinalOutcomes, _outcome, verdict_lines
 from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.tracking.run_content import (
     Summary,
@@ -57,6 +57,51 @@ ROWS = b"update,phase,noise\n1,training,0.0\n2,training,0.5\n3,training,0.0\n4,t
 
 
 # What is shown, without MLflow
+
+
+def test_twelve_costs_are_in_their_order() -> None:
+    costs = {f"cost_{i}": str(float(i)) for i in range(12)}
+    limits = {f"deploy_limit_{i}": str(100.0 + i) for i in range(12)}
+    verdict = {"feasible": "True", "optimal": "False", "exact": "False", "episode_return": "1"}
+    outcome = _outcome(
+        {"trial_id": "x", "task": "t", "agent": "a", "method": "m", **costs, **limits, **verdict}
+    )
+    assert outcome.costs == tuple(map(float, range(12)))
+    assert outcome.limits == tuple(100.0 + i for i in range(12))
+
+
+def test_a_database_that_another_process_made_first_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "mlflow.db"
+
+    class Client:
+        def __init__(self, uri: str) -> None:
+            self.path = sqlite_path(uri)
+
+        def search_experiments(self, max_results: int) -> None:
+            assert self.path
+            self.path.write_bytes(b"empty")
+            path.write_bytes(b"runs of another launch")  # meanwhile
+
+    monkeypatch.setattr("mlflow.tracking.MlflowClient", Client)
+    client.connect(f"sqlite:///{path}")
+    assert path.read_bytes() == b"runs of another launch"
+    assert {it.name for it in tmp_path.iterdir()} == {"mlflow.db", ".mlflow.db.lock"}
+
+
+def test_a_full_disk_ends_a_pass_and_not_the_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    tracker = mlflow_sync.Tracker(SweepStore(tmp_path, "s"), "sqlite:///x.db")
+    monkeypatch.setattr(tracker, "bring_up_to_date", full)
+    report = background_sync._pass(tracker, live=True)
+    assert "No space left" in report.problem
+    assert not report.is_up_to_date
+    assert "No space left" in capsys.readouterr().out
 
 
 def test_rows_behind_a_byte_are_read_with_the_byte_behind_each() -> None:
@@ -173,6 +218,12 @@ def test_the_note_has_a_line_a_group_with_means_over_seeds() -> None:
     text = note("demo", {"complete": 2, "failed": 0, "running": 1}, complete, charts="#/charts")
     assert text.splitlines()[0].startswith("**demo**: 3 trials (2 complete, 1 running). [Charts")
     assert text.splitlines()[-1] == "| river | cpo | dynamic | 2 | 8.50 |"
+
+
+def test_a_label_with_a_bar_stays_in_its_column() -> None:
+    summary = Summary(("t", "a|b", "m"), {"summary/deploy_return": 1.0})
+    text = note("s", {"complete": 1}, [summary], charts="c")
+    assert r"| t | a\|b | m | 1 | 1.00 |" in text
 
 
 def test_a_long_note_is_cut_where_mlflow_would_refuse_it() -> None:
@@ -742,6 +793,9 @@ def test_failed_trials_are_in_the_table_of_verdicts() -> None:
     alone = verdict_lines(outcomes, {group: [complete, complete]})
     assert alone[2].split(" | ")[3] == "solved 1 of 2, feasible 1 of 2"
     assert verdict_lines([], states) == []
+    barred = ("map", "a|b", "none")
+    renamed = [replace(outcome, group=barred) for outcome in outcomes]
+    assert verdict_lines(renamed, {barred: [complete]})[2].startswith(r"| map | a\|b | none |")
 
 
 def test_a_long_table_of_verdicts_leaves_room_for_the_rest() -> None:
