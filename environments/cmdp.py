@@ -245,6 +245,8 @@ class EpisodeStats:
         costs: undiscounted sums of costs, [k].
         limits: the cost limits in force when it ended, [k].
         noise: the curriculum's policy noise in force when it ended, in [0, 1].
+        begin_step: environment steps of the trial when the episode began, over all environments; None if
+            unknown. An episode may last many policy updates, and begin under other limits.
     """
 
     index: int
@@ -255,3 +257,4 @@ class EpisodeStats:
     costs: tuple[float, ...]
     limits: CostLimits
     noise: float
+    begin_step: int | None = None

@@ -32,6 +32,10 @@ literal pseudocode wherever it is defined.
   reach d_d only at B.
 - *Limits of a window.* The newer window lies entirely after the last change (line 4). The older one may lie
   before it, so an agent that follows each change immediately need not wait twice.
+- *Episodes that began before a change.* Policy updates may be short and episodes long. With 64 steps an
+  update, an episode of 1,000 steps spans 16 updates, and the first window after a change has only episodes
+  that began before it. With ``overlapping_episodes: ignore`` they do not count. The next decision then comes
+  an episode later, so the remaining budget has fewer steps of line 7.
 - *last_change* is reset when limits or policy have changed. Line 11 also resets it when neither has, that is,
   whenever the agent has converged. With a limit of d_d or noise of 0 that delays the next test by a window
   (``clock_reset``).
@@ -60,7 +64,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
-from recrl.environments.cmdp import CostLimits, CurriculumStep
+from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats
 from recrl.teachers.dynamic_options import DynamicConfig
 from recrl.teachers.start_limits import StartMeasurement
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState, already_seen, progress
@@ -215,7 +219,12 @@ def _tolerance(limit: float, standard_error: float, config: DynamicConfig) -> fl
 
 
 def steps_left(
-    last: WindowStatistics, *, env_steps: int, train_steps: int, unit: Literal["windows", "episodes"]
+    last: WindowStatistics,
+    *,
+    env_steps: int,
+    train_steps: int,
+    unit: Literal["windows", "episodes"],
+    duration: float = 0.0,
 ) -> int:
     """Return the number of steps of ``next_limit`` in the remaining budget, at the last window's pace.
 
@@ -224,6 +233,14 @@ def steps_left(
     rounded down. The last two windows are not counted, nor is the next episode: Algorithm 2 decides before it
     runs episode b, when B - b + 1 episodes remain.
 
+    Args:
+        last: the last window.
+        env_steps: taken so far.
+        train_steps: B.
+        unit: of the result.
+        duration: of an episode, in environment steps over all environments, if a window begins that much
+            after a change; else 0.
+
     >>> last = WindowStatistics(1000, episodes=8, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
     >>> [steps_left(last, env_steps=5500, train_steps=10000, unit=unit) for unit in ("windows", "episodes")]
     [2, 35]
@@ -231,15 +248,17 @@ def steps_left(
     steps = train_steps - env_steps
     if unit == "episodes":
         return steps * last.episodes // max(1, last.env_steps) - 1
-    return steps // max(1, last.env_steps) - 2
+    reserve = 2 * last.env_steps + duration
+    return int((steps - reserve) // max(1, last.env_steps + duration))
 
 
 class DynamicTeacher:
     """The dynamic curriculum as a function of its state.
 
     Its state holds ``update``, ``env_steps``, ``limits`` [k], ``policy_noise``, ``last_change`` (updates or
-    episodes since limits or policy were changed); ``history`` (``WindowStatistics`` of each comparable update
-    of the last two windows) and the keys of ``StartMeasurement``.
+    episodes since limits or policy were changed); ``changed_at`` (environment steps then); ``duration`` (of
+    the newest episodes, environment steps over all environments); ``history`` (``WindowStatistics`` of each
+    comparable update of the last two windows) and the keys of ``StartMeasurement``.
 
     Args:
         spec: d_t, d_d, B and the options of ``DynamicConfig``.
@@ -257,6 +276,8 @@ class DynamicTeacher:
             env_steps=0,
             step=CurriculumStep(self.spec.train_limits),
             last_change=0,
+            changed_at=0,
+            duration=0.0,
             history=(),
             start=self.measurement.begin(),
         )
@@ -267,10 +288,10 @@ class DynamicTeacher:
         if already_seen(state, report):
             return CurriculumStep.from_json(state), state
         start = self.measurement.advance(state, report)
-        history = self._history(state, report)
-        last_change = state["last_change"] + (
-            len(report.episodes) if self.config.window_unit == "episodes" else 1
-        )
+        counted = self._counted(state, report)
+        duration = _duration(counted, otherwise=state.get("duration", 0.0))
+        history = self._history(state, report, counted)
+        last_change = state["last_change"] + (len(counted) if self.config.window_unit == "episodes" else 1)
         before = CostLimits.from_json(state["limits"])
         limits = CostLimits(tuple(map(min, before, self.measurement.limits(start))))
         is_due = False  # line 4
@@ -280,7 +301,7 @@ class DynamicTeacher:
             step = CurriculumStep(limits)
         else:
             is_due = True
-            step = self._decide(limits, history, report.env_steps, last_change)
+            step = self._decide(limits, history, report.env_steps, last_change, duration)
         has_changed = step.limits != before or step.policy_noise > 0.0
         if is_due and self.config.clock_reset == "convergence":
             has_changed = has_changed or self._has_converged(history, last_change)
@@ -291,15 +312,26 @@ class DynamicTeacher:
             env_steps=report.env_steps,
             step=step,
             last_change=0 if has_changed else last_change,
+            changed_at=report.env_steps if has_changed else state.get("changed_at", 0),
+            duration=duration,
             history=history,
             start=start,
         )
         return CurriculumStep.from_json(next_state), next_state
 
-    def _history(self, state: TeacherState, report: ProgressReport) -> tuple[WindowStatistics, ...]:
+    def _counted(self, state: TeacherState, report: ProgressReport) -> tuple[EpisodeStats, ...]:
+        """Return the episodes of a report that count."""
+        if self.config.overlapping_episodes == "count":
+            return report.episodes
+        changed_at = state.get("changed_at", 0)
+        return tuple(it for it in report.episodes if it.begin_step is None or it.begin_step >= changed_at)
+
+    def _history(
+        self, state: TeacherState, report: ProgressReport, counted: Sequence[EpisodeStats]
+    ) -> tuple[WindowStatistics, ...]:
         """Return the updates of the last two windows, or all of them if they are fewer."""
         latest = WindowStatistics.of_update(
-            report.episodes,
+            counted,
             env_steps=report.env_steps - state["env_steps"],
             num_costs=len(self.spec.train_limits),
         )
@@ -356,7 +388,12 @@ class DynamicTeacher:
         return any(any(_converged(*windows, self.config)) for windows in groups if windows is not None)
 
     def _decide(
-        self, limits: CostLimits, history: Sequence[WindowStatistics], env_steps: int, last_change: int
+        self,
+        limits: CostLimits,
+        history: Sequence[WindowStatistics],
+        env_steps: int,
+        last_change: int,
+        duration: float,
     ) -> CurriculumStep:
         """Return the next step once W has passed since the last change."""
         values, noise = list(limits), 0.0
@@ -371,7 +408,11 @@ class DynamicTeacher:
                 limits=CostLimits(tuple(limits[index] for index in group)),
                 deploy_limits=CostLimits(tuple(self.spec.deploy_limits[index] for index in group)),
                 remaining=steps_left(
-                    new, env_steps=env_steps, train_steps=self.spec.train_steps, unit=self.config.remaining
+                    new,
+                    env_steps=env_steps,
+                    train_steps=self.spec.train_steps,
+                    unit=self.config.remaining,
+                    duration=duration if self.config.overlapping_episodes == "ignore" else 0.0,
                 ),
                 config=self.config,
             )
@@ -381,12 +422,20 @@ class DynamicTeacher:
         return CurriculumStep(CostLimits(tuple(values)), noise)
 
 
+def _duration(episodes: Sequence[EpisodeStats], *, otherwise: float) -> float:
+    """Return the mean duration of episodes in environment steps of the trial; a default without any."""
+    durations = [it.end_step - it.begin_step for it in episodes if it.begin_step is not None]
+    return math.fsum(durations) / len(durations) if durations else otherwise
+
+
 def _state(
     *,
     update: int,
     env_steps: int,
     step: CurriculumStep,
     last_change: int,
+    changed_at: int,
+    duration: float,
     history: Sequence[WindowStatistics],
     start: dict[str, Any],
 ) -> dict[str, Any]:
@@ -397,6 +446,8 @@ def _state(
         "limits": step.limits.to_json(),
         "policy_noise": step.policy_noise,
         "last_change": last_change,
+        "changed_at": changed_at,
+        "duration": duration,
         "history": [statistics.to_json() for statistics in history],
         **start,
     }

@@ -107,6 +107,12 @@ class DynamicConfig(Options):
         description="Whether each limit falls separately, or all together once all costs have "
         "converged and are kept (literal).",
     )
+    overlapping_episodes: Literal["count", "ignore"] = Field(
+        default="count",
+        description="Whether episodes count that began before the last change of limits or policy. If they "
+        "are ignored, line 7 divides by fewer remaining windows, by an episode's duration each.",
+        exclude_if=lambda value: value == "count",  # trials from before this option keep their identity
+    )
     policy_noise: float = Field(
         default=0.3,
         ge=0.0,

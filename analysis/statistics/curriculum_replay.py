@@ -77,11 +77,11 @@ def progress_reports(trial: TrialStore, updates: pd.DataFrame) -> Iterator[Progr
     for update, end_step, first, last in zip(
         updates["update"], updates["end_step"], starts, ends, strict=True
     ):
-        batch = tuple(_episode(row, num_costs) for row in rows[first:last])
+        batch = tuple(_episode(row, num_costs, trial.spec.num_envs) for row in rows[first:last])
         yield ProgressReport(update=int(update), env_steps=int(end_step), episodes=batch)
 
 
-def _episode(row: dict[Any, Any], num_costs: int) -> EpisodeStats:
+def _episode(row: dict[Any, Any], num_costs: int, num_envs: int) -> EpisodeStats:
     return EpisodeStats(
         index=row["index"],
         phase=Phase(row["phase"]),
@@ -91,4 +91,5 @@ def _episode(row: dict[Any, Any], num_costs: int) -> EpisodeStats:
         costs=tuple(row[f"cost_{i}"] for i in range(num_costs)),
         limits=CostLimits(tuple(row[f"limit_{i}"] for i in range(num_costs))),
         noise=row["noise"],
+        begin_step=row["end_step"] - row["length"] * num_envs,
     )

@@ -202,6 +202,7 @@ class Trial:
                 costs=episode.costs,
                 limits=step.limits,
                 noise=step.policy_noise,
+                begin_step=self.env_steps + (episode.step + 1 - episode.length) * self.spec.num_envs,
             )
             for offset, episode in enumerate(finished)
         )
