@@ -12,7 +12,8 @@ proportion to the coefficient, and both reach their final values together.
 
 If learning has converged at a coefficient tau, log pi(a | s) is the advantage over tau, up to a constant; see
 ``Experience.with_entropy``. The agent's multiplier must be able to grow until no violation pays. ``ppo-lag``
-(with a sufficient ``multiplier_maximum``) and ``cpo`` have this property.
+(with a sufficient ``multiplier_maximum``) and ``cpo`` have this property. The actions must be discrete: the
+entropy of a Gaussian policy has no bound.
 
 Notation: d the limit in force, d_t training limits, d_d deployment limits, B the training budget in
 environment steps, p in [0, 1] the used fraction of B, k the number of costs.

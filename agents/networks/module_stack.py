@@ -230,8 +230,8 @@ def checked_module(factory: ModuleFactory, num_inputs: int, num_outputs: int, *,
         role: of the network, for errors: ``policy`` or ``critic``.
 
     Raises:
-        NetworkError: it is no module, has buffers or no parameters, fails, returns another shape or type, or
-            its rows depend on one another.
+        NetworkError: it is no module, has buffers, no parameters or frozen ones, fails, returns another
+            shape or type, or its rows depend on one another.
     """
     name = getattr(factory, "__qualname__", "the network's factory")
     try:
@@ -249,6 +249,12 @@ def checked_module(factory: ModuleFactory, num_inputs: int, num_outputs: int, *,
         )
     if not list(module.parameters()):
         raise NetworkError("the network has no parameters")
+    frozen = [name for name, parameter in module.named_parameters() if not parameter.requires_grad]
+    if frozen:
+        raise NetworkError(
+            f"the network has frozen parameters ({', '.join(frozen)}), and all parameters are learnt: "
+            "compute what is fixed in a wrapper of the environment"
+        )
     rows = torch.linspace(-1.0, 1.0, 2 * num_inputs).reshape(2, num_inputs)
     try:
         with torch.no_grad():

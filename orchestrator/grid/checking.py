@@ -215,7 +215,7 @@ class _Check:
         """Check that the curriculum of each trial suits its agent and limits; one sentence per entry."""
         found: dict[Place, str] = {}
         for trial in grid.trials():
-            for section, sentence in unsuitable(trial):
+            for section, sentence in unsuitable(trial, self.cmdps[trial.task.label]):
                 entries, entry = (
                     (grid.agents, trial.agent) if section == "agents" else (grid.methods, trial.method)
                 )

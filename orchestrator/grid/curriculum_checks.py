@@ -5,16 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+from gymnasium.spaces import Discrete
+
+from recrl.environments.cmdp import CMDPSpec
 from recrl.orchestrator.spec import TrialSpec
 
 # Methods that measure nothing, whatever d_t is.
 MEASURING_NOTHING = ("none", "step", "unconstrained", "cooling")
 
 
-def unsuitable(trial: TrialSpec) -> Iterator[tuple[str, str]]:
+def unsuitable(trial: TrialSpec, cmdp: CMDPSpec) -> Iterator[tuple[str, str]]:
     """Yield what does not suit: the section of the grid to change, ``agents`` or ``methods``, and a sentence.
 
     Curricula measure mean costs. An agent that bounds a CVaR compares another value with the same limits.
+    The entropy of a Gaussian policy has no bound, although its actions are clipped.
+
+    Args:
+        trial: to be checked.
+        cmdp: of its task.
     """
     method, task = trial.method.name, trial.task.label
     if trial.agent.options.get("constraint") == "cvar":
@@ -30,6 +38,12 @@ def unsuitable(trial: TrialSpec) -> Iterator[tuple[str, str]]:
                 f"constraint: cvar does not suit the train_limits of {task}, which are measured as mean "
                 "costs; give them as numbers, or exclude the pair",
             )
+    if method == "cooling" and not isinstance(cmdp.action_space, Discrete):
+        yield (
+            "methods",
+            "cooling rewards the policy's entropy, which has no bound with the continuous actions of "
+            f"{task}; use another method, or exclude the pair",
+        )
     if method == "cooling" and not any(trial.deploy_limits):
         yield (
             "methods",

@@ -209,9 +209,14 @@ def mixed_rows(num_inputs: int, num_outputs: int) -> nn.Module:
     return _Mixed(num_inputs, num_outputs)
 
 
+def with_a_frozen_layer(num_inputs: int, num_outputs: int) -> nn.Module:
+    return nn.Sequential(nn.Linear(num_inputs, 4).requires_grad_(False), nn.Linear(4, num_outputs))
+
+
 @pytest.mark.parametrize(
     ("factory", "sentence"),
     [
+        (with_a_frozen_layer, r"the network has frozen parameters \(0.weight, 0.bias\), and all"),
         (no_module, "the network's factory returned a int, not a torch.nn.Module"),
         (of_another_shape, r"to torch.float32 \[2, 3\]: it must return float32 \[2, 2\]"),
         (with_statistics, "the network has buffers .*use layers without running statistics"),

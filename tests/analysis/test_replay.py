@@ -48,7 +48,14 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
 
 @pytest.mark.parametrize(
     "method",
-    [SPEC.method, Choice("linear"), Choice("exponential"), Choice("step"), Choice("unconstrained")],
+    [
+        SPEC.method,
+        Choice("dynamic", {"window": 2, "start_fraction": 0.1, "overlapping_episodes": "ignore"}),
+        Choice("linear"),
+        Choice("exponential"),
+        Choice("step"),
+        Choice("unconstrained"),
+    ],
     ids=lambda method: method.name,
 )
 def test_a_runs_own_teacher_gives_its_own_limits(tmp_path: Path, method: Choice) -> None:
@@ -67,6 +74,7 @@ def test_every_episode_is_reported_once_with_the_update_it_ended_in(trial: Trial
         assert all(
             report.env_steps - 60 < episode.end_step <= report.env_steps for episode in report.episodes
         )
+        assert all(episode.begin_step == episode.end_step - 40 for episode in report.episodes)  # 4 x 10 steps
 
 
 def test_another_teacher_sets_its_limits_on_the_same_episodes(trial: TrialStore) -> None:

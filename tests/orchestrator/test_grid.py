@@ -210,6 +210,14 @@ def test_cooling_cannot_relax_limits_of_0() -> None:
     assert problem.startswith("grid.yaml:4: methods.1: cooling relaxes a limit in proportion to it, ")
 
 
+def test_cooling_needs_discrete_actions() -> None:
+    (problem,) = _problems(SMALL.replace("linear", "cooling").replace("two-state", "continuous-bandit"))
+    assert problem == (
+        "grid.yaml:4: methods.1: cooling rewards the policy's entropy, which has no bound with the "
+        "continuous actions of continuous-bandit; use another method, or exclude the pair"
+    )
+
+
 def test_limits_are_the_tasks_own_or_the_grids() -> None:
     grid = _grid(
         """\

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
-from recrl.teachers.dynamic import decide, has_converged, is_precise, keeps_limit, next_limit, steps_left
+from recrl.teachers.dynamic import (
+    DynamicTeacher,
+    decide,
+    has_converged,
+    is_precise,
+    keeps_limit,
+    next_limit,
+    steps_left,
+)
 from recrl.teachers.dynamic_options import DynamicConfig
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
@@ -588,3 +596,110 @@ def test_no_decision_comes_from_fewer_than_ten_and_ten_episodes(unit: str, monke
         step, state = teacher.step(state, ProgressReport(update, 256 * update, episodes))
     assert compared
     assert min(map(min, compared)) >= 10
+
+
+# Episodes that began before a change.
+
+
+def long_episodes(teacher: DynamicTeacher, *, horizon: int, seed: int) -> tuple[int, int, list[float]]:
+    """An agent that obeys each limit at once, in 64 environments with 64 steps an update.
+
+    Each episode's cost scatters by a factor of its own; a step costs what the limit then in force allows.
+
+    Returns:
+        The number of changes of the limit, that of noises, and the limits.
+    """
+    envs, steps, budget = 64, 64, teacher.spec.train_steps
+    generator = np.random.default_rng(seed)
+    step, state = teacher.start()
+    ages = np.arange(envs) * horizon // envs
+    factors = np.maximum(generator.normal(1.0, 0.3, envs), 0.0)
+    costs = ages * step.limits[0] / horizon * factors
+    changes, noises, limits = 0, 0, []
+    for update in range(1, budget // (envs * steps) + 1):
+        before, finished = (update - 1) * envs * steps, []
+        for done in range(1, steps + 1):
+            costs += step.limits[0] / horizon * factors
+            ages += 1
+            for env in np.flatnonzero(ages == horizon):
+                end = before + done * envs
+                finished.append(
+                    EpisodeStats(
+                        0,
+                        Phase.TRAINING,
+                        end,
+                        horizon,
+                        20.0 + float(generator.normal(0.0, 3.0)),
+                        (float(costs[env]),),
+                        step.limits,
+                        0.0,
+                        begin_step=end - horizon * envs,
+                    )
+                )
+                ages[env], costs[env] = 0, 0.0
+                factors[env] = max(generator.normal(1.0, 0.3), 0.0)
+        old = step
+        report = ProgressReport(update, update * envs * steps, tuple(finished))
+        step, state = teacher.step(state, report)
+        changes += step.limits != old.limits
+        noises += step.policy_noise > 0.0
+        limits.append(step.limits[0])
+    return changes, noises, limits
+
+
+def teacher_of(budget: int = 950_000, **options: Any) -> DynamicTeacher:
+    return DynamicTeacher(TeacherSpec("dynamic", options, CostLimits((250.0,)), CostLimits((25.0,)), budget))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_obedient_agent_gets_little_noise_if_earlier_episodes_do_not_count(seed: int) -> None:
+    changes, noises, limits = long_episodes(
+        teacher_of(overlapping_episodes="ignore"), horizon=1000, seed=seed
+    )
+    assert noises <= 3  # by chance: a mean a little above its limit
+    assert 5 <= changes <= 12
+    assert limits[-1] == 25.0
+    reached = limits.index(25.0) / len(limits)
+    assert 0.6 <= reached <= 0.95
+    _, disturbed, _ = long_episodes(teacher_of(), horizon=1000, seed=seed)
+    assert disturbed >= 4
+
+
+def test_short_episodes_hardly_overlap_a_change() -> None:
+    counted, _, _ = long_episodes(teacher_of(), horizon=64, seed=0)
+    ignored, _, _ = long_episodes(teacher_of(overlapping_episodes="ignore"), horizon=64, seed=0)
+    assert ignored == pytest.approx(counted, rel=0.1)
+
+
+def test_only_episodes_that_began_after_the_change_are_in_the_windows() -> None:
+    teacher = teacher_of(100_000, overlapping_episodes="ignore", window=1, window_grows=False)
+
+    def reported(state: TeacherState, update: int, begin: int | None, cost: float) -> Any:
+        end = 1000 * update
+        episode = EpisodeStats(
+            0, Phase.TRAINING, end, 10, 9.5, (cost,), CostLimits((250.0,)), 0.0, begin_step=begin
+        )
+        return teacher.step(state, ProgressReport(update, end, (episode,)))
+
+    _, state = teacher.start()
+    _, state = reported(state, 1, 0, 250.0)
+    step, state = reported(state, 2, 0, 250.0)
+    assert step.limits[0] < 250.0
+    assert state["changed_at"] == 2000
+    lowered = step.limits
+    for update in (3, 4):  # an episode that began a step before the change tells nothing
+        step, state = reported(state, update, 1999, 250.0)
+        assert (step.limits, step.policy_noise) == (lowered, 0.0)
+    step, state = reported(state, 5, 2000, lowered[0])
+    assert (step.limits, step.policy_noise) == (lowered, 0.0)  # the first of two windows
+    step, state = reported(state, 6, None, lowered[0])  # unknown: counts
+    assert step.limits[0] < lowered[0]
+
+
+def test_the_remaining_steps_allow_for_an_episode_before_each_window() -> None:
+    last = WindowStatistics(1000, episodes=8, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
+    left = [
+        steps_left(last, env_steps=0, train_steps=20_000, unit="windows", duration=duration)
+        for duration in (0.0, 1000.0, 4000.0)
+    ]
+    assert left == [18, 8, 2]  # 20 - 2; (20 - 3) / 2; (20 - 6) / 5
