@@ -47,8 +47,10 @@ literal pseudocode wherever it is defined.
   start may be measured instead (``start_fraction``); then there is no decision until it is known.
 - *Several costs* (lines 5 to 7 say "for all i"). One cost that has not converged, or cannot be kept, would
   keep all other limits at d_t. Here each limit is separate. It falls when the return and its own cost have
-  converged and its own limit is kept. The policy gets noise when any converged cost is above its limit. A
-  step in one dimension makes the others wait for one window, and noise for two.
+  converged and its own limit is kept. With ``window_grows`` each cost has windows and a clock of its own: a
+  cost that scatters needs longer windows, and would never complete one if every step of another limit began
+  it anew. The policy gets noise when any converged cost is above its limit. Noise begins all windows anew, so
+  it waits until each cost has had two of them.
 - *The end.* At B the limits are d_d in any case, and there is no noise.
 
 Line 7 is used as it is: an agent whose converged cost is below d_d gets d_d immediately.
@@ -61,7 +63,8 @@ number of costs, eps_r, eps_c, eps_pi the paper's settings.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats
@@ -252,13 +255,36 @@ def steps_left(
     return int((steps - reserve) // max(1, last.env_steps + duration))
 
 
+@dataclass(frozen=True)
+class _Progress:
+    """What a curriculum knows of a group of costs with common windows.
+
+    Attributes:
+        last_change: updates or episodes since the group's limits or the policy were changed.
+        changed_at: environment steps then.
+        history: statistics of each comparable update of the last two windows, with the group's costs only.
+    """
+
+    last_change: int = 0
+    changed_at: int = 0
+    history: tuple[WindowStatistics, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        history = [statistics.to_json() for statistics in self.history]
+        return {"last_change": self.last_change, "changed_at": self.changed_at, "history": history}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> _Progress:
+        history = tuple(WindowStatistics.from_json(statistics) for statistics in values["history"])
+        return cls(int(values["last_change"]), int(values.get("changed_at", 0)), history)
+
+
 class DynamicTeacher:
     """The dynamic curriculum as a function of its state.
 
-    Its state holds ``update``, ``env_steps``, ``limits`` [k], ``policy_noise``, ``last_change`` (updates or
-    episodes since limits or policy were changed); ``changed_at`` (environment steps then); ``duration`` (of
-    the newest episodes, environment steps over all environments); ``history`` (``WindowStatistics`` of each
-    comparable update of the last two windows) and the keys of ``StartMeasurement``.
+    Its state holds ``update``, ``env_steps``, ``limits`` [k], ``policy_noise``; ``duration`` (of the newest
+    episodes, environment steps over all environments); ``groups`` (``_Progress`` of each group of costs with
+    common windows) and the keys of ``StartMeasurement``.
 
     Args:
         spec: d_t, d_d, B and the options of ``DynamicConfig``.
@@ -268,6 +294,9 @@ class DynamicTeacher:
         self.spec = spec
         self.config = DynamicConfig.model_validate(dict(spec.options))
         self.measurement = StartMeasurement(spec, self.config.start_fraction)
+        costs = tuple(range(len(spec.train_limits)))
+        is_separate = self.config.window_grows and self.config.dimensions == "separate"
+        self._groups = tuple((index,) for index in costs) if is_separate else (costs,)
 
     def start(self) -> tuple[CurriculumStep, TeacherState]:
         """See ``Teacher.start``."""
@@ -275,10 +304,8 @@ class DynamicTeacher:
             update=0,
             env_steps=0,
             step=CurriculumStep(self.spec.train_limits),
-            last_change=0,
-            changed_at=0,
             duration=0.0,
-            history=(),
+            groups=[_Progress()] * len(self._groups),
             start=self.measurement.begin(),
         )
         return CurriculumStep.from_json(state), state
@@ -288,127 +315,129 @@ class DynamicTeacher:
         if already_seen(state, report):
             return CurriculumStep.from_json(state), state
         start = self.measurement.advance(state, report)
-        counted = self._counted(state, report)
-        duration = _duration(counted, otherwise=state.get("duration", 0.0))
-        history = self._history(state, report, counted)
-        last_change = state["last_change"] + (len(counted) if self.config.window_unit == "episodes" else 1)
+        duration = _duration(report.episodes, otherwise=state.get("duration", 0.0))
+        groups = [
+            self._extended(each, costs, state["env_steps"], report)
+            for each, costs in zip(self._progress(state), self._groups, strict=True)
+        ]
         before = CostLimits.from_json(state["limits"])
         limits = CostLimits(tuple(map(min, before, self.measurement.limits(start))))
-        is_due = False  # line 4
+        is_due = [False] * len(groups)  # line 4
         if progress(report.env_steps, self.spec.train_steps) >= 1.0:
-            step, history = CurriculumStep(self.spec.deploy_limits), ()
-        elif start["start_limits"] is None or limits != before or last_change < self.config.window:
+            step = CurriculumStep(self.spec.deploy_limits)
+            groups = [replace(each, history=()) for each in groups]
+        elif start["start_limits"] is None or limits != before:
             step = CurriculumStep(limits)
         else:
-            is_due = True
-            step = self._decide(limits, history, report.env_steps, last_change, duration)
-        has_changed = step.limits != before or step.policy_noise > 0.0
-        if is_due and self.config.clock_reset == "convergence":
-            has_changed = has_changed or self._has_converged(history, last_change)
-        if step.policy_noise > 0.0 and self.config.windows_after_noise == 2:
-            history = ()
+            is_due = [each.last_change >= self.config.window for each in groups]
+            step = self._decide(limits, groups, is_due, env_steps=report.env_steps, duration=duration)
         next_state = _state(
             update=report.update,
             env_steps=report.env_steps,
             step=step,
-            last_change=0 if has_changed else last_change,
-            changed_at=report.env_steps if has_changed else state.get("changed_at", 0),
             duration=duration,
-            history=history,
+            groups=[
+                self._after(step, before, costs, each, is_due=due, env_steps=report.env_steps)
+                for costs, each, due in zip(self._groups, groups, is_due, strict=True)
+            ],
             start=start,
         )
         return CurriculumStep.from_json(next_state), next_state
 
-    def _counted(self, state: TeacherState, report: ProgressReport) -> tuple[EpisodeStats, ...]:
-        """Return the episodes of a report that count."""
-        if self.config.overlapping_episodes == "count":
-            return report.episodes
-        changed_at = state.get("changed_at", 0)
-        return tuple(it for it in report.episodes if it.begin_step is None or it.begin_step >= changed_at)
+    def _progress(self, state: TeacherState) -> list[_Progress]:
+        """Return the progress of each group; a state of an earlier version has one for all costs."""
+        if "groups" in state:
+            return [_Progress.from_json(values) for values in state["groups"]]
+        shared = _Progress.from_json(state)
+        return [
+            replace(shared, history=tuple(statistics.of_costs(costs) for statistics in shared.history))
+            for costs in self._groups
+        ]
 
-    def _history(
-        self, state: TeacherState, report: ProgressReport, counted: Sequence[EpisodeStats]
-    ) -> tuple[WindowStatistics, ...]:
-        """Return the updates of the last two windows, or all of them if they are fewer."""
+    def _extended(
+        self, group: _Progress, costs: tuple[int, ...], env_steps: int, report: ProgressReport
+    ) -> _Progress:
+        """Return a group's progress with one more update, and no more updates than two windows need."""
+        counted = report.episodes
+        if self.config.overlapping_episodes == "ignore":
+            counted = tuple(
+                it for it in counted if it.begin_step is None or it.begin_step >= group.changed_at
+            )
         latest = WindowStatistics.of_update(
-            counted,
-            env_steps=report.env_steps - state["env_steps"],
-            num_costs=len(self.spec.train_limits),
+            counted, env_steps=report.env_steps - env_steps, num_costs=len(self.spec.train_limits)
         )
         unit = self.config.window_unit
-        history = extend(
-            [WindowStatistics.from_json(statistics) for statistics in state["history"]], latest, unit=unit
-        )
-        needed = [self._last_two(history, group) for group in self._groups]
-        if any(windows is None for windows in needed):
-            return history
-        return history[-max(len(windows[0]) + len(windows[1]) for windows in needed if windows) :]
+        history = extend(group.history, latest.of_costs(costs), unit=unit)
+        if windows := self._last_two(history):
+            history = history[-len(windows[0]) - len(windows[1]) :]
+        last_change = group.last_change + (len(counted) if unit == "episodes" else 1)
+        return replace(group, last_change=last_change, history=history)
 
-    @property
-    def _groups(self) -> tuple[tuple[int, ...], ...]:
-        """Return the groups of costs with common windows: all costs, or each one separately."""
-        costs = tuple(range(len(self.spec.train_limits)))
-        if self.config.window_grows and self.config.dimensions == "separate":
-            return tuple((index,) for index in costs)
-        return (costs,)
+    def _after(
+        self,
+        step: CurriculumStep,
+        before: CostLimits,
+        costs: tuple[int, ...],
+        group: _Progress,
+        *,
+        is_due: bool,
+        env_steps: int,
+    ) -> _Progress:
+        """Return a group's progress after a step: a change begins its windows anew."""
+        is_noisy = step.policy_noise > 0.0
+        has_changed = is_noisy or any(step.limits[index] != before[index] for index in costs)
+        if is_due and self.config.clock_reset == "convergence":
+            windows = self._windows(group)
+            has_changed = has_changed or (windows is not None and any(_converged(*windows, self.config)))
+        if not has_changed:
+            return group
+        history = () if is_noisy and self.config.windows_after_noise == 2 else group.history
+        return _Progress(last_change=0, changed_at=env_steps, history=history)
 
     def _last_two(
-        self, history: Sequence[WindowStatistics], group: tuple[int, ...]
+        self, history: Sequence[WindowStatistics]
     ) -> tuple[tuple[WindowStatistics, ...], tuple[WindowStatistics, ...]] | None:
-        """Return the updates of the last two windows for a group of costs, or None if there are too few."""
+        """Return the updates of the last two windows, or None if there are too few."""
         config = self.config
-        return last_two_windows(
-            history,
-            config.window,
-            unit=config.window_unit,
-            is_enough=(lambda window: is_precise(window.of_costs(group), config))
-            if config.window_grows
-            else None,
-        )
+        is_enough = (lambda window: is_precise(window, config)) if config.window_grows else None
+        return last_two_windows(history, config.window, unit=config.window_unit, is_enough=is_enough)
 
-    def _is_due(self, newest: Sequence[WindowStatistics], last_change: int) -> bool:
-        """Whether a newest window lies entirely after the last change (line 4)."""
-        in_episodes = self.config.window_unit == "episodes"
-        length = sum(each.episodes for each in newest) if in_episodes else len(newest)
-        return not self.config.window_grows or last_change >= length
+    def _windows(self, group: _Progress) -> tuple[WindowStatistics, WindowStatistics] | None:
+        """Return the last two windows of a group, each pooled; None if there are too few updates.
 
-    def _windows(
-        self, history: Sequence[WindowStatistics], group: tuple[int, ...], last_change: int
-    ) -> tuple[WindowStatistics, WindowStatistics] | None:
-        """Return the last two windows of a group of costs, each pooled; None if too few or too old."""
-        windows = self._last_two(history, group)
-        if windows is None or not self._is_due(windows[1], last_change):
+        The newer one lies entirely after the last change (line 4).
+        """
+        windows = self._last_two(group.history)
+        if windows is None:
             return None
-        old, new = (WindowStatistics.pooled(window).of_costs(group) for window in windows)
-        return old, new
-
-    def _has_converged(self, history: Sequence[WindowStatistics], last_change: int) -> bool:
-        """Whether line 11 is reached: the test of line 5 holds in some dimension, or jointly."""
-        groups = (self._windows(history, group, last_change) for group in self._groups)
-        return any(any(_converged(*windows, self.config)) for windows in groups if windows is not None)
+        in_episodes = self.config.window_unit == "episodes"
+        length = sum(each.episodes for each in windows[1]) if in_episodes else len(windows[1])
+        if self.config.window_grows and group.last_change < length:
+            return None
+        return WindowStatistics.pooled(windows[0]), WindowStatistics.pooled(windows[1])
 
     def _decide(
         self,
         limits: CostLimits,
-        history: Sequence[WindowStatistics],
+        groups: Sequence[_Progress],
+        is_due: Sequence[bool],
+        *,
         env_steps: int,
-        last_change: int,
         duration: float,
     ) -> CurriculumStep:
-        """Return the next step once W has passed since the last change."""
-        values, noise = list(limits), 0.0
-        for group in self._groups:
-            windows = self._windows(history, group, last_change)
+        """Return the next step; noise begins the windows of all groups anew, so it waits for the last one."""
+        values, noise, has_windows = list(limits), 0.0, True
+        for costs, group, due in zip(self._groups, groups, is_due, strict=True):
+            windows = self._windows(group) if due else None
             if windows is None:
+                has_windows = False
                 continue
-            old, new = windows
             step = decide(
-                old,
-                new,
-                limits=CostLimits(tuple(limits[index] for index in group)),
-                deploy_limits=CostLimits(tuple(self.spec.deploy_limits[index] for index in group)),
+                *windows,
+                limits=CostLimits(tuple(limits[index] for index in costs)),
+                deploy_limits=CostLimits(tuple(self.spec.deploy_limits[index] for index in costs)),
                 remaining=steps_left(
-                    new,
+                    windows[1],
                     env_steps=env_steps,
                     train_steps=self.spec.train_steps,
                     unit=self.config.remaining,
@@ -417,9 +446,9 @@ class DynamicTeacher:
                 config=self.config,
             )
             noise = max(noise, step.policy_noise)
-            for index, value in zip(group, step.limits, strict=True):
+            for index, value in zip(costs, step.limits, strict=True):
                 values[index] = value
-        return CurriculumStep(CostLimits(tuple(values)), noise)
+        return CurriculumStep(CostLimits(tuple(values)), noise if has_windows else 0.0)
 
 
 def _duration(episodes: Sequence[EpisodeStats], *, otherwise: float) -> float:
@@ -433,10 +462,8 @@ def _state(
     update: int,
     env_steps: int,
     step: CurriculumStep,
-    last_change: int,
-    changed_at: int,
     duration: float,
-    history: Sequence[WindowStatistics],
+    groups: Sequence[_Progress],
     start: dict[str, Any],
 ) -> dict[str, Any]:
     """Return a state as JSON."""
@@ -445,9 +472,7 @@ def _state(
         "env_steps": env_steps,
         "limits": step.limits.to_json(),
         "policy_noise": step.policy_noise,
-        "last_change": last_change,
-        "changed_at": changed_at,
         "duration": duration,
-        "history": [statistics.to_json() for statistics in history],
+        "groups": [group.to_json() for group in groups],
         **start,
     }

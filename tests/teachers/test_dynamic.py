@@ -489,7 +489,7 @@ def test_a_difficult_dimension_delays_an_easy_one_by_at_most_a_window() -> None:
 
 def test_the_state_stays_small() -> None:
     run = play(obedient, train=(250.0,), deploy=(5.0,), updates=100, episodes=lambda step: 100)
-    assert run.state["history"] == []
+    assert [group["history"] for group in run.state["groups"]] == [[]]
     for options in ({}, {"window": 80, "window_unit": "episodes"}):
         teacher = make_teacher(
             TeacherSpec("dynamic", options, CostLimits((250.0,)), CostLimits((5.0,)), train_steps=10**6)
@@ -500,7 +500,7 @@ def test_the_state_stays_small() -> None:
                 EpisodeStats(0, Phase.TRAINING, update, 1, 1.0, (9.0,), CostLimits((9.0,)), 0.0),
             ) * 30
             _, state = teacher.step(state, ProgressReport(update, update, episodes))
-        assert len(state["history"]) <= 10
+        assert all(len(group["history"]) <= 10 for group in state["groups"])
 
 
 def test_noise_is_not_judged_before_there_are_enough_episodes() -> None:
@@ -598,6 +598,71 @@ def test_no_decision_comes_from_fewer_than_ten_and_ten_episodes(unit: str, monke
     assert min(map(min, compared)) >= 10
 
 
+def several_costs(kinds: tuple[tuple[float, bool], ...], *, seed: int) -> tuple[list[int], int]:
+    """An agent whose costs scatter and obey their limits, or are stuck above them; 4 episodes an update.
+
+    Args:
+        kinds: of each cost its relative standard deviation, and whether it is stuck at 40 under 30.
+        seed: of the costs.
+
+    Returns:
+        The number of changes of each limit in 470 updates, and that of noises.
+    """
+    generator = np.random.default_rng(seed)
+    train = tuple(30.0 if stuck else 100.0 for _, stuck in kinds)
+    deploy = tuple(30.0 if stuck else 25.0 for _, stuck in kinds)
+    teacher = make_teacher(TeacherSpec("dynamic", {}, CostLimits(train), CostLimits(deploy), 470))
+    step, state = teacher.start()
+    changes, noises = [0] * len(kinds), 0
+    for update in range(1, 470):
+        means = [40.0 if stuck else limit for limit, (_, stuck) in zip(step.limits, kinds, strict=True)]
+        costs = [
+            np.maximum(generator.normal(mean, spread * mean, 4), 0.0)
+            for mean, (spread, _) in zip(means, kinds, strict=True)
+        ]
+        finished = tuple(
+            EpisodeStats(
+                0, Phase.TRAINING, update, 1, float(generator.normal(20.0, 1.0)), each, step.limits, 0.0
+            )
+            for each in zip(*(column.tolist() for column in costs), strict=True)
+        )
+        old = step
+        step, state = teacher.step(state, ProgressReport(update, update, finished))
+        changes = [
+            count + (new != before)
+            for count, new, before in zip(changes, step.limits, old.limits, strict=True)
+        ]
+        noises += step.policy_noise > 0.0
+    return changes, noises
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_cost_with_long_windows_is_not_held_up_by_one_with_short_windows(seed: int) -> None:
+    [alone], _ = several_costs(((0.8, False),), seed=seed)
+    (quick, slow), _ = several_costs(((0.1, False), (0.8, False)), seed=seed)
+    assert quick > 2 * slow
+    assert slow >= 0.7 * alone
+    (stuck, beside), noises = several_costs(((0.05, True), (0.8, False)), seed=seed)
+    assert stuck == 0
+    assert beside >= 4  # noise waits until it has had two windows
+    assert noises >= 10
+
+
+def test_a_state_of_before_the_groups_goes_on() -> None:
+    spec = TeacherSpec("dynamic", {}, CostLimits((50.0, 60.0)), CostLimits((5.0, 5.0)), 1000)
+    teacher = make_teacher(spec)
+    _, state = teacher.start()
+    for update in range(1, 5):
+        episode = EpisodeStats(0, Phase.TRAINING, update, 1, 9.5, (50.0, 60.0), CostLimits((50.0, 60.0)), 0.0)
+        _, state = teacher.step(state, ProgressReport(update, update, (episode,)))
+    shared = {key: value for key, value in state.items() if key not in ("groups", "duration")}
+    record = [1, 1, 9.5, [50.0, 60.0], [0.0, 0.0], 0.0]
+    earlier = {**shared, "last_change": 4, "history": [record] * 4}
+    assert state["groups"][1]["history"] == [[1, 1, 9.5, [60.0], [0.0], 0.0]] * 4
+    report = ProgressReport(5, 5, ())
+    assert teacher.step(earlier, report) == teacher.step(state, report)
+
+
 # Episodes that began before a change.
 
 
@@ -685,7 +750,7 @@ def test_only_episodes_that_began_after_the_change_are_in_the_windows() -> None:
     _, state = reported(state, 1, 0, 250.0)
     step, state = reported(state, 2, 0, 250.0)
     assert step.limits[0] < 250.0
-    assert state["changed_at"] == 2000
+    assert state["groups"][0]["changed_at"] == 2000
     lowered = step.limits
     for update in (3, 4):  # an episode that began a step before the change tells nothing
         step, state = reported(state, update, 1999, 250.0)
