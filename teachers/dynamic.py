@@ -47,9 +47,9 @@ literal pseudocode wherever it is defined.
   start may be measured instead (``start_fraction``); then there is no decision until it is known.
 - *Several costs* (lines 5 to 7 say "for all i"). One cost that has not converged, or cannot be kept, would
   keep all other limits at d_t. Here each limit is separate. It falls when the return and its own cost have
-  converged and its own limit is kept. With ``window_grows`` each cost has windows and a clock of its own: a
-  cost that scatters needs longer windows, and would never complete one if every step of another limit began
-  it anew. The policy gets noise when any converged cost is above its limit. Noise begins all windows anew, so
+  converged and its own limit is kept. With ``window_grows`` each cost has windows and a clock of its own. A
+  cost that scatters needs longer windows. If every step of another limit began them anew, they would never be
+  complete. The policy gets noise when any converged cost is above its limit. Noise begins all windows anew, so
   it waits until each cost has had two of them.
 - *The end.* At B the limits are d_d in any case, and there is no noise.
 
