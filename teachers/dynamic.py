@@ -48,9 +48,9 @@ literal pseudocode wherever it is defined.
 - *Several costs* (lines 5 to 7 say "for all i"). One cost that has not converged, or cannot be kept, would
   keep all other limits at d_t. Here each limit is separate. It falls when the return and its own cost have
   converged and its own limit is kept. With ``window_grows`` each cost has windows and a clock of its own. A
-  cost that scatters needs longer windows. If every step of another limit began them anew, they would never be
-  complete. The policy gets noise when any converged cost is above its limit. Noise begins all windows anew, so
-  it waits until each cost has had two of them.
+  cost that scatters needs longer windows. If every step of another limit began them anew, they would never
+  be complete. The policy gets noise when any converged cost is above its limit. Noise begins all windows
+  anew, so it waits until each cost has had two of them.
 - *The end.* At B the limits are d_d in any case, and there is no noise.
 
 Line 7 is used as it is: an agent whose converged cost is below d_d gets d_d immediately.
