@@ -34,8 +34,9 @@ literal pseudocode wherever it is defined.
   before it, so an agent that follows each change immediately need not wait twice.
 - *Episodes that began before a change.* Policy updates may be short and episodes long. With 64 steps an
   update, an episode of 1,000 steps spans 16 updates, and the first window after a change has only episodes
-  that began before it. With ``overlapping_episodes: ignore`` they do not count. The next decision then comes
-  an episode later, so the remaining budget has fewer steps of line 7.
+  that began before it: they would look converged and above the new limit. So they do not count
+  (``overlapping_episodes``). The next decision then comes an episode later, so the remaining budget has fewer
+  steps of line 7.
 - *last_change* is reset when limits or policy have changed. Line 11 also resets it when neither has, that is,
   whenever the agent has converged. With a limit of d_d or noise of 0 that delays the next test by a window
   (``clock_reset``).

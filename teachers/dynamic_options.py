@@ -21,6 +21,7 @@ PAPER = {
     "adherence_tolerance": "none",
     "windows_after_noise": 1,
     "remaining": "episodes",
+    "overlapping_episodes": "count",
     "clock_reset": "convergence",
     "dimensions": "joint",
 }
@@ -107,11 +108,10 @@ class DynamicConfig(Options):
         description="Whether each limit falls separately, or all together once all costs have "
         "converged and are kept (literal).",
     )
-    overlapping_episodes: Literal["count", "ignore"] = Field(
-        default="count",
-        description="Whether episodes count that began before the last change of limits or policy. If they "
-        "are ignored, line 7 divides by fewer remaining windows, by an episode's duration each.",
-        exclude_if=lambda value: value == "count",  # trials from before this option keep their identity
+    overlapping_episodes: Literal["ignore", "count"] = Field(
+        default="ignore",
+        description="Whether episodes count that began before the last change of limits or policy (literal). "
+        "If they are ignored (ours), windows begin an episode later, and line 7 has fewer steps.",
     )
     policy_noise: float = Field(
         default=0.3,

@@ -718,26 +718,24 @@ def teacher_of(budget: int = 950_000, **options: Any) -> DynamicTeacher:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_an_obedient_agent_gets_little_noise_if_earlier_episodes_do_not_count(seed: int) -> None:
-    changes, noises, limits = long_episodes(
-        teacher_of(overlapping_episodes="ignore"), horizon=1000, seed=seed
-    )
+    changes, noises, limits = long_episodes(teacher_of(), horizon=1000, seed=seed)
     assert noises <= 3  # by chance: a mean a little above its limit
     assert 5 <= changes <= 12
     assert limits[-1] == 25.0
     reached = limits.index(25.0) / len(limits)
     assert 0.6 <= reached <= 0.95
-    _, disturbed, _ = long_episodes(teacher_of(), horizon=1000, seed=seed)
+    _, disturbed, _ = long_episodes(teacher_of(overlapping_episodes="count"), horizon=1000, seed=seed)
     assert disturbed >= 4
 
 
 def test_short_episodes_hardly_overlap_a_change() -> None:
-    counted, _, _ = long_episodes(teacher_of(), horizon=64, seed=0)
-    ignored, _, _ = long_episodes(teacher_of(overlapping_episodes="ignore"), horizon=64, seed=0)
+    counted, _, _ = long_episodes(teacher_of(overlapping_episodes="count"), horizon=64, seed=0)
+    ignored, _, _ = long_episodes(teacher_of(), horizon=64, seed=0)
     assert ignored == pytest.approx(counted, rel=0.1)
 
 
 def test_only_episodes_that_began_after_the_change_are_in_the_windows() -> None:
-    teacher = teacher_of(100_000, overlapping_episodes="ignore", window=1, window_grows=False)
+    teacher = teacher_of(100_000, window=1, window_grows=False)
 
     def reported(state: TeacherState, update: int, begin: int | None, cost: float) -> Any:
         end = 1000 * update
