@@ -34,9 +34,10 @@ literal pseudocode wherever it is defined.
   before it, so an agent that follows each change immediately need not wait twice.
 - *Episodes that began before a change.* Policy updates may be short and episodes long. With 64 steps an
   update, an episode of 1,000 steps spans 16 updates, and the first window after a change has only episodes
-  that began before it: they would look converged and above the new limit. So they do not count
-  (``overlapping_episodes``). The next decision then comes an episode later, so the remaining budget has fewer
-  steps of line 7.
+  that began before it: they may look converged and above the new limit. With ``overlapping_episodes: ignore``
+  no episode counts that ends within the duration of the longest one after a change. If all that began after
+  the change did count, the first ones to end would be the short ones, which are often the cheap ones. The
+  next decision comes later by that duration, so the remaining budget has fewer steps of line 7.
 - *last_change* is reset when limits or policy have changed. Line 11 also resets it when neither has, that is,
   whenever the agent has converged. With a limit of d_d or noise of 0 that delays the next test by a window
   (``clock_reset``).
@@ -228,7 +229,7 @@ def steps_left(
     env_steps: int,
     train_steps: int,
     unit: Literal["windows", "episodes"],
-    duration: float = 0.0,
+    duration: int = 0,
 ) -> int:
     """Return the number of steps of ``next_limit`` in the remaining budget, at the last window's pace.
 
@@ -242,8 +243,8 @@ def steps_left(
         env_steps: taken so far.
         train_steps: B.
         unit: of the result.
-        duration: of an episode, in environment steps over all environments, if a window begins that much
-            after a change; else 0.
+        duration: of the longest episode, in environment steps over all environments, if windows begin that
+            much after a change; else 0.
 
     >>> last = WindowStatistics(1000, episodes=8, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
     >>> [steps_left(last, env_steps=5500, train_steps=10000, unit=unit) for unit in ("windows", "episodes")]
@@ -253,7 +254,7 @@ def steps_left(
     if unit == "episodes":
         return steps * last.episodes // max(1, last.env_steps) - 1
     reserve = 2 * last.env_steps + duration
-    return int((steps - reserve) // max(1, last.env_steps + duration))
+    return (steps - reserve) // max(1, last.env_steps + duration)
 
 
 @dataclass(frozen=True)
@@ -283,9 +284,9 @@ class _Progress:
 class DynamicTeacher:
     """The dynamic curriculum as a function of its state.
 
-    Its state holds ``update``, ``env_steps``, ``limits`` [k], ``policy_noise``; ``duration`` (of the newest
-    episodes, environment steps over all environments); ``groups`` (``_Progress`` of each group of costs with
-    common windows) and the keys of ``StartMeasurement``.
+    Its state holds ``update``, ``env_steps``, ``limits`` [k], ``policy_noise``; ``longest`` (duration of the
+    longest episode so far, environment steps over all environments); ``groups`` (``_Progress`` of each group
+    of costs with common windows) and the keys of ``StartMeasurement``.
 
     Args:
         spec: d_t, d_d, B and the options of ``DynamicConfig``.
@@ -305,7 +306,7 @@ class DynamicTeacher:
             update=0,
             env_steps=0,
             step=CurriculumStep(self.spec.train_limits),
-            duration=0.0,
+            longest=0,
             groups=[_Progress()] * len(self._groups),
             start=self.measurement.begin(),
         )
@@ -316,9 +317,9 @@ class DynamicTeacher:
         if already_seen(state, report):
             return CurriculumStep.from_json(state), state
         start = self.measurement.advance(state, report)
-        duration = _duration(report.episodes, otherwise=state.get("duration", 0.0))
+        longest = max([state.get("longest", 0), *map(_duration, report.episodes)])
         groups = [
-            self._extended(each, costs, state["env_steps"], report)
+            self._extended(each, costs, report, env_steps=state["env_steps"], longest=longest)
             for each, costs in zip(self._progress(state), self._groups, strict=True)
         ]
         before = CostLimits.from_json(state["limits"])
@@ -331,12 +332,12 @@ class DynamicTeacher:
             step = CurriculumStep(limits)
         else:
             is_due = [each.last_change >= self.config.window for each in groups]
-            step = self._decide(limits, groups, is_due, env_steps=report.env_steps, duration=duration)
+            step = self._decide(limits, groups, is_due, env_steps=report.env_steps, longest=longest)
         next_state = _state(
             update=report.update,
             env_steps=report.env_steps,
             step=step,
-            duration=duration,
+            longest=longest,
             groups=[
                 self._after(step, before, costs, each, is_due=due, env_steps=report.env_steps)
                 for costs, each, due in zip(self._groups, groups, is_due, strict=True)
@@ -356,14 +357,18 @@ class DynamicTeacher:
         ]
 
     def _extended(
-        self, group: _Progress, costs: tuple[int, ...], env_steps: int, report: ProgressReport
+        self,
+        group: _Progress,
+        costs: tuple[int, ...],
+        report: ProgressReport,
+        *,
+        env_steps: int,
+        longest: int,
     ) -> _Progress:
         """Return a group's progress with one more update, and no more updates than two windows need."""
         counted = report.episodes
         if self.config.overlapping_episodes == "ignore":
-            counted = tuple(
-                it for it in counted if it.begin_step is None or it.begin_step >= group.changed_at
-            )
+            counted = tuple(it for it in counted if it.end_step >= group.changed_at + longest)
         latest = WindowStatistics.of_update(
             counted, env_steps=report.env_steps - env_steps, num_costs=len(self.spec.train_limits)
         )
@@ -424,7 +429,7 @@ class DynamicTeacher:
         is_due: Sequence[bool],
         *,
         env_steps: int,
-        duration: float,
+        longest: int,
     ) -> CurriculumStep:
         """Return the next step; noise begins the windows of all groups anew, so it waits for the last one."""
         values, noise, has_windows = list(limits), 0.0, True
@@ -442,7 +447,7 @@ class DynamicTeacher:
                     env_steps=env_steps,
                     train_steps=self.spec.train_steps,
                     unit=self.config.remaining,
-                    duration=duration if self.config.overlapping_episodes == "ignore" else 0.0,
+                    duration=longest if self.config.overlapping_episodes == "ignore" else 0,
                 ),
                 config=self.config,
             )
@@ -452,10 +457,9 @@ class DynamicTeacher:
         return CurriculumStep(CostLimits(tuple(values)), noise if has_windows else 0.0)
 
 
-def _duration(episodes: Sequence[EpisodeStats], *, otherwise: float) -> float:
-    """Return the mean duration of episodes in environment steps of the trial; a default without any."""
-    durations = [it.end_step - it.begin_step for it in episodes if it.begin_step is not None]
-    return math.fsum(durations) / len(durations) if durations else otherwise
+def _duration(episode: EpisodeStats) -> int:
+    """Return the duration of an episode in environment steps over all environments; 0 if unknown."""
+    return 0 if episode.begin_step is None else episode.end_step - episode.begin_step
 
 
 def _state(
@@ -463,7 +467,7 @@ def _state(
     update: int,
     env_steps: int,
     step: CurriculumStep,
-    duration: float,
+    longest: int,
     groups: Sequence[_Progress],
     start: dict[str, Any],
 ) -> dict[str, Any]:
@@ -473,7 +477,7 @@ def _state(
         "env_steps": env_steps,
         "limits": step.limits.to_json(),
         "policy_noise": step.policy_noise,
-        "duration": duration,
+        "longest": longest,
         "groups": [group.to_json() for group in groups],
         **start,
     }

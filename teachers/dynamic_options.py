@@ -21,7 +21,6 @@ PAPER = {
     "adherence_tolerance": "none",
     "windows_after_noise": 1,
     "remaining": "episodes",
-    "overlapping_episodes": "count",
     "clock_reset": "convergence",
     "dimensions": "joint",
 }
@@ -108,10 +107,11 @@ class DynamicConfig(Options):
         description="Whether each limit falls separately, or all together once all costs have "
         "converged and are kept (literal).",
     )
-    overlapping_episodes: Literal["ignore", "count"] = Field(
-        default="ignore",
-        description="Whether episodes count that began before the last change of limits or policy (literal). "
-        "If they are ignored (ours), windows begin an episode later, and line 7 has fewer steps.",
+    overlapping_episodes: Literal["count", "ignore"] = Field(
+        default="count",
+        description="Whether episodes count that may have begun before the last change of limits or policy. "
+        "If they are ignored, windows begin later by the longest episode, and line 7 has fewer steps.",
+        exclude_if=lambda value: value == "count",  # trials from before this option keep their identity
     )
     policy_noise: float = Field(
         default=0.3,

@@ -146,7 +146,12 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
 
 
 def _remove_earlier(folder: Path, written: Sequence[Path]) -> None:
-    """Remove tables of an earlier grid that were not written again: they can always be computed."""
+    """Remove tables of an earlier grid that were not written again, beside an earlier report.
+
+    They can always be computed. In a folder without a report a file of such a name may be the user's.
+    """
+    if not (folder / "report.html").exists():
+        return
     for name in {OUTCOMES_FILE, *OTHER_TABLES} - {path.name for path in written}:
         (folder / name).unlink(missing_ok=True)
 

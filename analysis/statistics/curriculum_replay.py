@@ -2,7 +2,7 @@
 
 A teacher is a pure function of the trial's reports, so it can be called again with a run's files. Every
 policy update becomes the ``ProgressReport`` that the trial sent. A run's own teacher gives the run's own
-limits.
+limits, if the teacher has not changed since.
 
 The replay does not predict the agent's results under the other limits: the episodes are still those under the
 recorded limits. It shows the effect of a curriculum's options on given episodes, for example of a dynamic

@@ -50,7 +50,7 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
     "method",
     [
         SPEC.method,
-        Choice("dynamic", {"window": 2, "start_fraction": 0.1, "overlapping_episodes": "count"}),
+        Choice("dynamic", {"window": 2, "start_fraction": 0.1, "overlapping_episodes": "ignore"}),
         Choice("linear"),
         Choice("exponential"),
         Choice("step"),

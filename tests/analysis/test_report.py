@@ -168,6 +168,9 @@ def test_no_table_or_figure_of_an_earlier_grid_stays_beside_a_new_report(
     for name in (*stale, "return-against-cost.png", "mine.csv"):
         (tmp_path / name).write_text("old")
     running = dataclasses.replace(finished, trials=finished.trials.assign(status="running"))
+    table_files.write_tables(running, tmp_path)  # no report is here: they may be somebody's own
+    assert all((tmp_path / name).read_text() == "old" for name in stale)
+    (tmp_path / "report.html").write_text("old")
     drawing.sketch(running, tmp_path)
     assert [name for name in stale if (tmp_path / name).exists()] == []
     assert not (tmp_path / "return-against-cost.png").exists()

@@ -29,7 +29,7 @@ DEFINITIONS = {
         "22.5": "a limit",
         "1e7": "steps of a published run",
         "120": "a count, see test_the_table_of_rivergrid_is_counted",
-        "0.06": "a p-value, likewise",
+        "0.21": "a p-value, likewise",
     },
 }
 NUMBER = re.compile(r"(?<![\w.,/-])-?\d[\d,]*(?:\.\d+)*(?:e-?\d+)?%?(?![\w/-])")
