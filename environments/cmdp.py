@@ -98,6 +98,11 @@ class CMDPSpec:
         return None if shape is None else math.prod(shape)
 
     @property
+    def has_continuous_actions(self) -> bool:
+        """Whether actions are floating-point numbers."""
+        return np.issubdtype(self.action_space.dtype, np.floating)
+
+    @property
     def num_costs(self) -> int:
         """Number of cost functions, k."""
         return len(self.cost_names)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from gymnasium.spaces import Discrete
-
 from recrl.environments.cmdp import CMDPSpec
 from recrl.orchestrator.spec import TrialSpec
 
@@ -38,7 +36,7 @@ def unsuitable(trial: TrialSpec, cmdp: CMDPSpec) -> Iterator[tuple[str, str]]:
                 f"constraint: cvar does not suit the train_limits of {task}, which are measured as mean "
                 "costs; give them as numbers, or exclude the pair",
             )
-    if method == "cooling" and not isinstance(cmdp.action_space, Discrete):
+    if method == "cooling" and cmdp.has_continuous_actions:
         yield (
             "methods",
             "cooling rewards the policy's entropy, which has no bound with the continuous actions of "
