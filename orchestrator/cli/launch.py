@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 
 def run_launch(request: LaunchRequest, console: Console) -> ExitCode:
     """Run the incomplete trials of a grid file."""
-    if request.tracking_uri and not request.mlflow:
-        raise RecrlError("--no-mlflow, --tracking-uri: give one of them")
     grid = read_grid(request.grid)
     options = LaunchOptions(
         root=request.root,

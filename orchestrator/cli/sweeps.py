@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
+from recrl.orchestrator.cli.output import short
 from recrl.orchestrator.cli.requests import SweepRequest
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
@@ -38,7 +39,7 @@ def command_line(command: str, store: SweepStore, tracking_uri: str | None = Non
     words = ["recrl-sweep", command, store.name]
     root = store.folder.parent
     if root.resolve() != Path(DEFAULT_ROOT).resolve():
-        words += ["--root", str(root)]
+        words += ["--root", str(short(root))]
     if tracking_uri:
         words += ["--tracking-uri", redacted(tracking_uri)]
     return shlex.join(words)

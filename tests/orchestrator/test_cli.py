@@ -574,10 +574,6 @@ def test_an_option_that_would_be_ignored_is_refused(
             ["figures", "small.zip", "--storage", "memory://x"],
             "small.zip, --storage: give one of them, the place to read the sweep from",
         ),
-        (
-            ["launch", "grid.yaml", *INLINE[:2], "--no-mlflow", "--tracking-uri", "sqlite:///x.db"],
-            "--no-mlflow, --tracking-uri: give one of them",
-        ),
     ],
 )
 def test_options_that_exclude_each_other_start_nothing(

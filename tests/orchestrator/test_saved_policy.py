@@ -331,7 +331,8 @@ def test_evaluate_leaves_out_what_has_no_checkpoint(
     assert capsys.readouterr().err == f"recrl-sweep: {sentence}"
     assert main(["evaluate", "--root", root, "small", "nobody"]) == ExitCode.WRONG_INPUT
     assert capsys.readouterr().err == (
-        "recrl-sweep: small: no trials on disk begin with 'nobody'; see recrl-sweep status small\n"
+        "recrl-sweep: small: no trials on disk begin with 'nobody'; "
+        f"see recrl-sweep status small --root {root}\n"
     )
 
 
