@@ -52,7 +52,7 @@ literal pseudocode wherever it is defined.
   converged and its own limit is kept. With ``window_grows`` each cost has windows and a clock of its own. A
   cost that scatters needs longer windows. If every step of another limit began them anew, they would never
   be complete. The policy gets noise when any converged cost is above its limit. Noise begins all windows
-  anew, so it waits until each cost has had two of them.
+  anew, so it waits until each cost has two of them at once.
 - *The end.* At B the limits are d_d in any case, and there is no noise.
 
 Line 7 is used as it is: an agent whose converged cost is below d_d gets d_d immediately.
@@ -258,7 +258,7 @@ def steps_left(
 
 
 @dataclass(frozen=True)
-class _Progress:
+class _GroupState:
     """What a curriculum knows of a group of costs with common windows.
 
     Attributes:
@@ -276,7 +276,7 @@ class _Progress:
         return {"last_change": self.last_change, "changed_at": self.changed_at, "history": history}
 
     @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> _Progress:
+    def from_json(cls, values: Mapping[str, Any]) -> _GroupState:
         history = tuple(WindowStatistics.from_json(statistics) for statistics in values["history"])
         return cls(int(values["last_change"]), int(values.get("changed_at", 0)), history)
 
@@ -285,8 +285,8 @@ class DynamicTeacher:
     """The dynamic curriculum as a function of its state.
 
     Its state holds ``update``, ``env_steps``, ``limits`` [k], ``policy_noise``; ``longest`` (duration of the
-    longest episode so far, environment steps over all environments); ``groups`` (``_Progress`` of each group
-    of costs with common windows) and the keys of ``StartMeasurement``.
+    longest episode so far, environment steps over all environments); ``groups`` (``_GroupState`` of each
+    group of costs with common windows) and the keys of ``StartMeasurement``.
 
     Args:
         spec: d_t, d_d, B and the options of ``DynamicConfig``.
@@ -307,7 +307,7 @@ class DynamicTeacher:
             env_steps=0,
             step=CurriculumStep(self.spec.train_limits),
             longest=0,
-            groups=[_Progress()] * len(self._groups),
+            groups=[_GroupState()] * len(self._groups),
             start=self.measurement.begin(),
         )
         return CurriculumStep.from_json(state), state
@@ -320,7 +320,7 @@ class DynamicTeacher:
         longest = max([state.get("longest", 0), *map(_duration, report.episodes)])
         groups = [
             self._extended(each, costs, report, env_steps=state["env_steps"], longest=longest)
-            for each, costs in zip(self._progress(state), self._groups, strict=True)
+            for each, costs in zip(self._group_states(state), self._groups, strict=True)
         ]
         before = CostLimits.from_json(state["limits"])
         limits = CostLimits(tuple(map(min, before, self.measurement.limits(start))))
@@ -346,11 +346,11 @@ class DynamicTeacher:
         )
         return CurriculumStep.from_json(next_state), next_state
 
-    def _progress(self, state: TeacherState) -> list[_Progress]:
-        """Return the progress of each group; a state of an earlier version has one for all costs."""
+    def _group_states(self, state: TeacherState) -> list[_GroupState]:
+        """Return the state of each group; in a state of an earlier version all costs share one."""
         if "groups" in state:
-            return [_Progress.from_json(values) for values in state["groups"]]
-        shared = _Progress.from_json(state)
+            return [_GroupState.from_json(values) for values in state["groups"]]
+        shared = _GroupState.from_json(state)
         return [
             replace(shared, history=tuple(statistics.of_costs(costs) for statistics in shared.history))
             for costs in self._groups
@@ -358,14 +358,14 @@ class DynamicTeacher:
 
     def _extended(
         self,
-        group: _Progress,
+        group: _GroupState,
         costs: tuple[int, ...],
         report: ProgressReport,
         *,
         env_steps: int,
         longest: int,
-    ) -> _Progress:
-        """Return a group's progress with one more update, and no more updates than two windows need."""
+    ) -> _GroupState:
+        """Return a group's state with one more update, and no more updates than two windows need."""
         counted = report.episodes
         if self.config.overlapping_episodes == "ignore":
             counted = tuple(it for it in counted if it.end_step >= group.changed_at + longest)
@@ -384,12 +384,12 @@ class DynamicTeacher:
         step: CurriculumStep,
         before: CostLimits,
         costs: tuple[int, ...],
-        group: _Progress,
+        group: _GroupState,
         *,
         is_due: bool,
         env_steps: int,
-    ) -> _Progress:
-        """Return a group's progress after a step: a change begins its windows anew."""
+    ) -> _GroupState:
+        """Return a group's state after a step: a change of its limits, or noise, restarts its clock."""
         is_noisy = step.policy_noise > 0.0
         has_changed = is_noisy or any(step.limits[index] != before[index] for index in costs)
         if is_due and self.config.clock_reset == "convergence":
@@ -398,7 +398,7 @@ class DynamicTeacher:
         if not has_changed:
             return group
         history = () if is_noisy and self.config.windows_after_noise == 2 else group.history
-        return _Progress(last_change=0, changed_at=env_steps, history=history)
+        return _GroupState(last_change=0, changed_at=env_steps, history=history)
 
     def _last_two(
         self, history: Sequence[WindowStatistics]
@@ -408,10 +408,10 @@ class DynamicTeacher:
         is_enough = (lambda window: is_precise(window, config)) if config.window_grows else None
         return last_two_windows(history, config.window, unit=config.window_unit, is_enough=is_enough)
 
-    def _windows(self, group: _Progress) -> tuple[WindowStatistics, WindowStatistics] | None:
+    def _windows(self, group: _GroupState) -> tuple[WindowStatistics, WindowStatistics] | None:
         """Return the last two windows of a group, each pooled; None if there are too few updates.
 
-        The newer one lies entirely after the last change (line 4).
+        It is also None until the newer one lies entirely after the last change (line 4).
         """
         windows = self._last_two(group.history)
         if windows is None:
@@ -425,7 +425,7 @@ class DynamicTeacher:
     def _decide(
         self,
         limits: CostLimits,
-        groups: Sequence[_Progress],
+        groups: Sequence[_GroupState],
         is_due: Sequence[bool],
         *,
         env_steps: int,
@@ -468,7 +468,7 @@ def _state(
     env_steps: int,
     step: CurriculumStep,
     longest: int,
-    groups: Sequence[_Progress],
+    groups: Sequence[_GroupState],
     start: dict[str, Any],
 ) -> dict[str, Any]:
     """Return a state as JSON."""

@@ -59,13 +59,23 @@ COMPARED_CLAIMS_NOTE = (
     "curriculum's mean, where that is above 0 beyond its interval. Feasible pairs: seeds whose two final "
     "policies are feasible. The paper's gains are at the end of the training phase."
 )
-OTHER_TABLES = ("claims.csv", "verdicts.csv", "summary.csv", "comparisons.csv", "outcomes.tex")
 FAILED_CLAIMS_NOTE = "In a seed with a failed trial a claim does not hold."
 FAILED_NOTE = (
     "A failed trial counts as neither feasible nor solved; the means are over the n complete trials."
 )
 NO_GAIN = (
     "–: a policy of a pair is infeasible, with one curriculum or the other; more return is then no gain."
+)
+
+
+# Written only if a trial is complete, or if there is a claim to count.
+CONDITIONAL_TABLES = (
+    OUTCOMES_FILE,
+    "claims.csv",
+    "verdicts.csv",
+    "summary.csv",
+    "comparisons.csv",
+    "outcomes.tex",
 )
 
 
@@ -152,7 +162,7 @@ def _remove_earlier(folder: Path, written: Sequence[Path]) -> None:
     """
     if not (folder / "report.html").exists():
         return
-    for name in {OUTCOMES_FILE, *OTHER_TABLES} - {path.name for path in written}:
+    for name in {*CONDITIONAL_TABLES} - {path.name for path in written}:
         (folder / name).unlink(missing_ok=True)
 
 

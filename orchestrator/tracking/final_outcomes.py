@@ -27,6 +27,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.tracking.positions import file_mark
+from recrl.orchestrator.tracking.run_content import table_line
 
 
 @dataclass(frozen=True)
@@ -178,14 +179,13 @@ def verdict_lines(
     for outcome in outcomes:
         groups[outcome.group].append(outcome)
     heads = ("task", "agent", "curriculum", "verdict", "cost", "limit", "return", "n")
-    lines = ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
+    lines = [table_line(heads), "|" + " --- |" * len(heads)]
     for group, seeds in groups.items():
         costs = [_mean(values) for values in zip(*(it.costs for it in seeds), strict=True)]
         verdicts = _verdicts(seeds, states[group])
         cells = (verdicts, _listed(costs, digits=3), _listed(seeds[0].limits if seeds else ()))
         earned = _text(_mean([it.episode_return for it in seeds])) if seeds else ""
-        labels = [label.replace("|", r"\|") for label in group]
-        lines.append("| " + " | ".join([*labels, *cells, earned, str(len(seeds))]) + " |")
+        lines.append(table_line([*group, *cells, earned, str(len(seeds))]))
     return lines
 
 

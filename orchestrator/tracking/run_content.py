@@ -241,20 +241,28 @@ def note(
     if names:
         heads = ["task", "agent", "curriculum", "n", *(value.replace("_", " ") for value in names)]
         lines += ["", "**Deployment phase**, in which learning goes on: means over complete trials.", ""]
-        lines += ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
+        lines += [table_line(heads), "|" + " --- |" * len(heads)]
     for group in sorted({trial.group for trial in complete}):
         trials = [trial.values for trial in complete if trial.group == group]
         means = [
             _mean_text([values[f"summary/{value}"] for values in trials if f"summary/{value}" in values])
             for value in names
         ]
-        labels = [label.replace("|", r"\|") for label in group]
-        line = "| " + " | ".join([*labels, str(len(trials)), *means]) + " |"
+        line = table_line([*group, str(len(trials)), *means])
         if sum(map(len, lines)) + len(lines) + len(line) > MAX_NOTE:
             lines += ["", "More groups than fit here: see the table figure."]
             break
         lines.append(line)
     return "\n".join(lines)
+
+
+def table_line(cells: Iterable[str]) -> str:
+    r"""Return a line of a Markdown table; a bar in a cell does not end it.
+
+    >>> table_line(["a|b", "1"])
+    '| a\\|b | 1 |'
+    """
+    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
 
 
 def single_values(values: Mapping[str, float], seconds: float) -> list[Point]:
