@@ -129,7 +129,7 @@ class Plan:
 
     @property
     def other_versions(self) -> tuple[frozenset[str], ...]:
-        """Return the other versions of libraries that each trial ran with that is not run again.
+        """Return the other versions of libraries that a kept trial ran with, by trial.
 
         It is empty if nothing is to do, because then no versions are mixed.
         """
