@@ -13,11 +13,11 @@ from recrl.environments.registry import make_vector, optimal_return
 
 
 @dataclass(frozen=True)
-class Lesson:
+class Training:
     """A task, an agent, limits that bind, how long to learn, and with how many seeds it is tested here.
 
-    With no seed, a lesson is only in the table of ``tests/benchmarks/learning.py``. An agent steers by the
-    mean cost of an update's episodes; who needs to know it better has more environments.
+    Trainings without a seed are only in the table of ``tests/benchmarks/known_optima.py``. An agent knows the
+    mean cost of an update's episodes; those that must know it more precisely have more environments.
     """
 
     agent: str
@@ -31,64 +31,64 @@ class Lesson:
 
 # The closed-form optimum is of a policy without noise.
 NO_BOUND = {"min_std": 0.0}
-LESSONS = [
-    Lesson("ppo-lag", "two-state", (3.0,), 150),
-    Lesson("cpo", "two-state", (3.0,), 80),
-    Lesson("ppo-lag", "two-state-2", (5.0, 2.0), 150, num_envs=64),
-    Lesson("cpo", "two-state-2", (5.0, 2.0), 80),
-    Lesson("ppo-lag", "continuous-bandit", (2.5,), 500, options=NO_BOUND),
-    Lesson("cpo", "continuous-bandit", (2.5,), 80, options=NO_BOUND),
-    Lesson("trpo-lag", "two-state", (3.0,), 150),
-    Lesson("trpo-lag", "two-state-2", (5.0, 2.0), 200),
-    Lesson("trpo-lag", "continuous-bandit", (2.5,), 150, options=NO_BOUND),
-    Lesson("pcpo", "two-state", (3.0,), 100),
-    Lesson("pcpo", "two-state-2", (5.0, 2.0), 100),
-    Lesson("pcpo", "continuous-bandit", (2.5,), 100, options=NO_BOUND),
-    Lesson("focops", "two-state", (3.0,), 150),
-    Lesson("focops", "two-state-2", (5.0, 2.0), 150, num_envs=128),
-    Lesson("p3o", "two-state", (3.0,), 200),
-    Lesson("p3o", "two-state-2", (5.0, 2.0), 200, num_envs=128),
-    Lesson("ipo", "two-state", (3.0,), 200),
-    Lesson("ipo", "two-state-2", (5.0, 2.0), 200, seeds=0),
-    Lesson("crpo", "two-state", (3.0,), 100),
-    Lesson("crpo", "two-state-2", (5.0, 2.0), 300, num_envs=128),
+TRAININGS = [
+    Training("ppo-lag", "two-state", (3.0,), 150),
+    Training("cpo", "two-state", (3.0,), 80),
+    Training("ppo-lag", "two-state-2", (5.0, 2.0), 150, num_envs=64),
+    Training("cpo", "two-state-2", (5.0, 2.0), 80),
+    Training("ppo-lag", "continuous-bandit", (2.5,), 500, options=NO_BOUND),
+    Training("cpo", "continuous-bandit", (2.5,), 80, options=NO_BOUND),
+    Training("trpo-lag", "two-state", (3.0,), 150),
+    Training("trpo-lag", "two-state-2", (5.0, 2.0), 200),
+    Training("trpo-lag", "continuous-bandit", (2.5,), 150, options=NO_BOUND),
+    Training("pcpo", "two-state", (3.0,), 100),
+    Training("pcpo", "two-state-2", (5.0, 2.0), 100),
+    Training("pcpo", "continuous-bandit", (2.5,), 100, options=NO_BOUND),
+    Training("focops", "two-state", (3.0,), 150),
+    Training("focops", "two-state-2", (5.0, 2.0), 150, num_envs=128),
+    Training("p3o", "two-state", (3.0,), 200),
+    Training("p3o", "two-state-2", (5.0, 2.0), 200, num_envs=128),
+    Training("ipo", "two-state", (3.0,), 200),
+    Training("ipo", "two-state-2", (5.0, 2.0), 200, seeds=0),
+    Training("crpo", "two-state", (3.0,), 100),
+    Training("crpo", "two-state-2", (5.0, 2.0), 300, num_envs=128),
 ]
 
 
-def last_quarter(lesson: Lesson, seed: int) -> tuple[float, Floats]:
+def last_quarter(training: Training, seed: int) -> tuple[float, Floats]:
     """Mean return and costs [k] of the episodes of the last quarter of learning."""
     environment_seed, agent_seed, policy_seed = np.random.SeedSequence(seed).spawn(3)
-    environments = make_vector(lesson.task, lesson.num_envs)
-    agent = make_agent(lesson.agent, environments.cmdp, lesson.options, agent_seed)
+    environments = make_vector(training.task, training.num_envs)
+    agent = make_agent(training.agent, environments.cmdp, training.options, agent_seed)
     collector = Collector(environments, num_steps=20)
     collector.reset(seed=int(environment_seed.generate_state(1)[0]))
     generator = np.random.default_rng(policy_seed)
     kept: list[FinishedEpisode] = []
-    for update in range(lesson.updates):
+    for update in range(training.updates):
         rollout, episodes = collector.collect(agent, generator)
-        costs = episode_costs(episodes, len(lesson.limits))
-        agent.update(rollout, costs, CurriculumStep(CostLimits(lesson.limits)))
-        if update >= 0.75 * lesson.updates:
+        costs = episode_costs(episodes, len(training.limits))
+        agent.update(rollout, costs, CurriculumStep(CostLimits(training.limits)))
+        if update >= 0.75 * training.updates:
             kept += episodes
     returns = [episode.episode_return for episode in kept]
     return float(np.mean(returns)), np.mean([episode.costs for episode in kept], axis=0)
 
 
 @pytest.mark.parametrize(
-    ("lesson", "seed"),
+    ("training", "seed"),
     [
-        pytest.param(lesson, seed, id=f"{lesson.agent}-{lesson.task}-{seed}")
-        for lesson in LESSONS
-        for seed in range(lesson.seeds)
+        pytest.param(training, seed, id=f"{training.agent}-{training.task}-{seed}")
+        for training in TRAININGS
+        for seed in range(training.seeds)
     ],
 )
-def test_an_agent_reaches_the_constrained_optimum(lesson: Lesson, seed: int) -> None:
-    optimum = optimal_return(lesson.task, {}, CostLimits(lesson.limits))
-    unconstrained = optimal_return(lesson.task, {}, CostLimits.unlimited(len(lesson.limits)))
+def test_an_agent_reaches_the_constrained_optimum(training: Training, seed: int) -> None:
+    optimum = optimal_return(training.task, {}, CostLimits(training.limits))
+    unconstrained = optimal_return(training.task, {}, CostLimits.unlimited(len(training.limits)))
     assert optimum is not None and unconstrained is not None
     assert unconstrained > optimum + 1.0  # the constraint binds
-    episode_return, costs = last_quarter(lesson, seed)
-    assert np.all(costs <= np.array(lesson.limits) + 0.05)
+    episode_return, costs = last_quarter(training, seed)
+    assert np.all(costs <= np.array(training.limits) + 0.05)
     assert episode_return >= optimum - 0.1
 
 
@@ -96,6 +96,6 @@ def test_an_agent_reaches_the_constrained_optimum(lesson: Lesson, seed: int) -> 
 def test_a_control_reaches_the_unconstrained_optimum_whatever_the_limit(agent: str) -> None:
     optimum = optimal_return("two-state", {}, CostLimits.unlimited(1))
     assert optimum is not None
-    episode_return, costs = last_quarter(Lesson(agent, "two-state", (3.0,), 80), seed=0)
+    episode_return, costs = last_quarter(Training(agent, "two-state", (3.0,), 80), seed=0)
     assert episode_return >= optimum - 0.1
     assert costs[0] == pytest.approx(9.0, abs=0.1)
