@@ -47,7 +47,7 @@ logger = logging.getLogger("recrl.sweep")
 
 @dataclass(frozen=True)
 class LaunchOptions:
-    """What a launch is asked for, besides its grid.
+    """The options of a launch.
 
     Attributes:
         root: the folder of all sweeps.

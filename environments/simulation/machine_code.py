@@ -49,7 +49,7 @@ def kept(compiler: Any, function: Any) -> Any:
 
 
 def salted(function: Any) -> Any:
-    """The same function to Numba, but that machine code kept for it is found under ``source_digest`` only.
+    """Return a copy of a function whose stored machine code Numba uses only while ``source_digest`` is the same.
 
     Numba compares what a function's free variables hold, so the digest becomes an unused free variable.
     """

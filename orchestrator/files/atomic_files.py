@@ -115,7 +115,7 @@ def parsed_object(data: bytes, name: str) -> dict[str, Any]:
     try:
         value = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise DamagedError(f"{name} is no JSON") from error
+        raise DamagedError(f"{name} is not JSON") from error
     if not isinstance(value, dict):
         raise DamagedError(f"{name} must hold a JSON object, it holds a {type(value).__name__}")
     return value

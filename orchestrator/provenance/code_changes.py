@@ -1,10 +1,11 @@
 """Detect whether a trial ran other code, or with other versions of libraries, than is installed now.
 
 A trial's results depend on recrl's tasks, agents, curricula and training loop, not on figures or commands:
-only the former are in the digest. A user's task, agent or curriculum has a digest of its top-level package
-(all Python files) or single module. Each module of the user's project that it imports, directly or through
-others, has one too. Nothing is imported to find them: import statements are read from the files. So modules
-in the working directory are found also where a command may not import them.
+only the former are in the digest. Docstrings and comments are not, because they cannot change a result.
+A user's task, agent or curriculum has a digest of its top-level package (all Python files) or single module.
+Each module of the user's project that it imports, directly or through others, has one too. Nothing is
+imported to find them: import statements are read from the files. So modules in the working directory are
+found also where a command may not import them.
 
 The project is the nearest folder above the module that holds a project file or a repository, else the
 module's own folder. Installed packages, the standard library and imports by a computed name are left out.
@@ -33,7 +34,7 @@ from recrl.environments.registry import TASKS
 from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.provenance.own_package import digest_of_files, folder_of
+from recrl.orchestrator.provenance.own_package import digest_of_code, folder_of
 from recrl.orchestrator.provenance.versions import package_versions
 from recrl.orchestrator.spec import TrialSpec
 from recrl.teachers.registry import TEACHERS
@@ -229,12 +230,12 @@ def _own_digest() -> str:
     trial = {f"orchestrator/{module}": folder_of("orchestrator") / module for module in MODULES}
     if missing := [str(path) for path in trial.values() if not path.is_file()]:
         raise FileNotFoundError(f"{', '.join(missing)}: results depend on it, and it is missing")
-    return digest_of_files({**files, **trial})[:16]
+    return digest_of_code({**files, **trial})[:16]
 
 
 def _digests_of(package: str) -> dict[str, str]:
     """Return the digest of a top-level package or module, and of those of its project that it imports."""
-    return {name: digest_of_files(files)[:16] for name, files in _with_imports(package).items()}
+    return {name: digest_of_code(files)[:16] for name, files in _with_imports(package).items()}
 
 
 def _with_imports(package: str) -> dict[str, dict[str, Path]]:

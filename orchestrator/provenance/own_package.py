@@ -6,9 +6,11 @@ import hashlib
 import importlib.metadata
 import importlib.util
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
+
+from recrl.orchestrator.provenance.source_text import without_documentation
 
 DISTRIBUTION = "recrl"
 FOLDERS = ("agents", "analysis", "environments", "orchestrator", "teachers")
@@ -25,11 +27,28 @@ def source_digest() -> str:
 
 
 def digest_of_files(files: Mapping[str, Path]) -> str:
-    """64 hex digits that differ whenever a name or what is in a file does."""
+    """Return 64 hex digits that change with the name of a file and with any of its bytes."""
+    return _digest(files, lambda content: content)
+
+
+def digest_of_code(files: Mapping[str, Path]) -> str:
+    """Return 64 hex digits that change with the code in files: docstrings and comments do not count.
+
+    Of files that are not Python every byte counts.
+    """
+    python = {name: path for name, path in files.items() if path.suffix == ".py"}
+    others = {name: path for name, path in files.items() if name not in python}
+    return hashlib.sha256(
+        f"{_digest(python, without_documentation)} {digest_of_files(others)}".encode()
+    ).hexdigest()
+
+
+def _digest(files: Mapping[str, Path], part: Callable[[bytes], bytes]) -> str:
+    """Return the digest of the names of files and of a part of their contents."""
     digest = hashlib.sha256()
     for name, path in sorted(files.items()):
         with suppress(OSError):  # an editor's file that came and went
-            digest.update(hashlib.sha256(path.read_bytes()).digest() + f"{name}\n".encode())
+            digest.update(hashlib.sha256(part(path.read_bytes())).digest() + f"{name}\n".encode())
     return digest.hexdigest()
 
 

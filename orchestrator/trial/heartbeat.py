@@ -36,7 +36,7 @@ class Heartbeat:
         self._lost: LostLeaseError | None = None
 
     def beating(self) -> AbstractContextManager[None]:
-        """Beat beside the thread that calls this, until the end of the ``with`` block."""
+        """Beat in a second thread until the end of the ``with`` block, while the calling one works."""
         clock = time.pthread_getcpuclockid(threading.get_ident())
         return background_thread(partial(self._run, clock), name="heartbeat")
 

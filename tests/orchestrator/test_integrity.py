@@ -309,7 +309,7 @@ def test_evaluate_leaves_out_a_trial_whose_last_checkpoint_is_gone(
     ("name", "text", "sentence"),
     [
         ("state.json", "", "state.json is empty"),
-        ("state.json", "{", "state.json is no JSON"),
+        ("state.json", "{", "state.json is not JSON"),
         ("state.json", "[1]", "state.json must hold a JSON object, it holds a list"),
         ("state.json", None, "state.json is missing"),
         ("spec.json", None, "spec.json is missing, "),

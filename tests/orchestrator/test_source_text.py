@@ -1,0 +1,82 @@
+"""Which changes of a source change what is compared: those that can change a result."""
+
+import pytest
+
+from recrl.orchestrator.provenance.source_text import without_documentation
+
+SOURCE = '''\
+"""What the module is for.
+
+Over several lines.
+"""
+
+import os
+
+
+class Box:
+    """A box."""
+
+    size = 3  # as measured
+
+    def area(self):
+        """Return
+        # the area.
+        """
+        # squared
+        return self.size**2
+
+
+MAP = """
+# a wall
+
+..
+"""
+'''
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("What the module is for.", "A module."),
+        ("Over several lines.\n", ""),
+        ('    """A box."""\n\n', ""),
+        ("# the area.", "the area, in square metres"),
+        ("        # squared\n", ""),
+        ("import os\n\n\n", "# for files\nimport os\n"),
+    ],
+)
+def test_documentation_does_not_count(old: str, new: str) -> None:
+    changed = SOURCE.replace(old, new)
+    assert changed != SOURCE
+    assert without_documentation(changed.encode()) == without_documentation(SOURCE.encode())
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("size = 3", "size = 4"),
+        ("# a wall", "# a door"),  # within a string
+        ("wall\n\n", "wall\n"),
+        ('MAP = """', 'PLAN = """'),
+        ("        return", "    return"),
+    ],
+)
+def test_code_and_strings_count(old: str, new: str) -> None:
+    changed = SOURCE.replace(old, new)
+    assert changed != SOURCE
+    assert without_documentation(changed.encode()) != without_documentation(SOURCE.encode())
+
+
+def test_code_on_the_line_of_a_docstring_counts() -> None:
+    one, two = b'"Text."; a = 1\n', b'"Other text."; a = 2\n'
+    assert without_documentation(one) == b"; a = 1"
+    assert without_documentation(two) == b"; a = 2"
+
+
+def test_letters_outside_ascii_are_cut_at_the_right_byte() -> None:
+    assert without_documentation('"""Größe."""; a = "ß"\n'.encode()) == '; a = "ß"'.encode()
+
+
+@pytest.mark.parametrize("source", [b"def f(:\n    # x\n", b"\x00", b"\xff\xfe"])
+def test_what_does_not_parse_stays(source: bytes) -> None:
+    assert without_documentation(source) == source
