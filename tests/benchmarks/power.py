@@ -3,9 +3,9 @@
     python tests/benchmarks/power.py results/safety-gym/agents.csv results/safety-gym/curricula-today.csv
 
 The spread is the standard deviation s of the returns of final policies of one agent and curriculum on a task,
-over seeds and repetitions, pooled over the groups of the task. For n seeds of each of two curricula the table
-has the smallest true difference that a t test at 5% finds with a probability of 80%. The trials count as
-independent. The power is exact, from the noncentral t distribution.
+over seeds and repetitions, pooled over agents and curricula. For n seeds of each of two curricula the table has the
+smallest true difference that a t test at 5% finds with a probability of 80%. With ``--tests N`` the level is
+5% / N (Bonferroni). The trials count as independent. The power is exact, from the noncentral t distribution.
 """
 
 from __future__ import annotations
@@ -16,22 +16,23 @@ import math
 import pandas as pd
 from scipy import optimize, stats
 
-LEVEL, POWER = 0.05, 0.8
+POWER = 0.8
 SEEDS = (3, 5, 10, 20)
 
 
-def power(difference: float, seeds: int) -> float:
+def power(difference: float, seeds: int, level: float) -> float:
     """Return the power of a two-sided t test of two groups; the difference is in standard deviations."""
     degrees, shift = 2 * seeds - 2, difference * math.sqrt(seeds / 2.0)
-    critical = stats.t.ppf(1.0 - LEVEL / 2.0, degrees)
+    critical = stats.t.ppf(1.0 - level / 2.0, degrees)
     return float(1.0 - stats.nct.cdf(critical, degrees, shift) + stats.nct.cdf(-critical, degrees, shift))
 
 
-def detectable(seeds: int) -> float:
+def detectable(seeds: int, level: float) -> float:
     """Return the difference, in standard deviations, that is found with probability POWER."""
-    return float(
-        optimize.brentq(lambda difference: power(difference, seeds) - POWER, 0.0, 6.0 / math.sqrt(seeds))
-    )
+    reach = 1.0 / math.sqrt(seeds)
+    while power(reach, seeds, level) < POWER:
+        reach *= 1.2
+    return float(optimize.brentq(lambda difference: power(difference, seeds, level) - POWER, 0.0, reach))
 
 
 def pooled(returns: pd.DataFrame) -> tuple[float, int]:
@@ -45,15 +46,21 @@ def pooled(returns: pd.DataFrame) -> tuple[float, int]:
 def main() -> None:
     parser = argparse.ArgumentParser(description="How large a difference some seeds can show.")
     parser.add_argument("tables", nargs="+", help="CSV files of final policies")
+    parser.add_argument("--agents", nargs="+", metavar="LABEL", help="default: all")
+    parser.add_argument("--tests", type=int, default=1, help="the number of tests; default: 1")
     given = parser.parse_args()
+    level = 0.05 / given.tests
     read = pd.concat([pd.read_csv(path) for path in given.tables], ignore_index=True)
     rows = read[read["policy"] == "stochastic"].drop_duplicates(["task", "agent", "method", "seed", "return"])
+    if given.agents:
+        rows = rows[rows["agent"].isin(given.agents)]
+    units = {seeds: detectable(seeds, level) for seeds in SEEDS}
     print("differences in standard deviations:")
-    print("  ", ", ".join(f"{detectable(seeds):.2f} with {seeds} seeds" for seeds in SEEDS))
+    print("  ", ", ".join(f"{unit:.2f} with {seeds} seeds" for seeds, unit in units.items()))
     print(f"{'task':14}{'s':>7}{'(degrees)':>11}" + "".join(f"{seeds:>4} seeds" for seeds in SEEDS))
     for task, returns in rows.groupby("task"):
         spread, degrees = pooled(returns)
-        shown = "".join(f"{spread * detectable(seeds):>10.1f}" for seeds in SEEDS)
+        shown = "".join(f"{spread * unit:>10.1f}" for unit in units.values())
         print(f"{task:14}{spread:7.2f}{degrees:11}" + shown)
 
 
