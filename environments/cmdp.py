@@ -80,6 +80,8 @@ class CMDPSpec:
     components: tuple[ObservationComponent, ...] = ()
 
     def __post_init__(self) -> None:
+        if isinstance(self.cost_names, str):
+            raise ValueError(f"{self.name}: cost_names must be a tuple of names, got {self.cost_names!r}")
         if not self.cost_names:
             raise ValueError(f"{self.name}: a CMDP needs at least one cost function, got none")
         if len(set(self.cost_names)) != len(self.cost_names):
@@ -122,7 +124,9 @@ class CostLimits:
     values: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "values", tuple(float(value) for value in self.values))
+        if isinstance(self.values, str):
+            raise ValueError(f"cost limits must be numbers, got {self.values!r}")
+        object.__setattr__(self, "values", tuple(float(value) + 0.0 for value in self.values))  # no -0.0
         if not self.values:
             raise ValueError("cost limits: at least one is needed, got none")
         for value in self.values:
@@ -200,8 +204,11 @@ class CurriculumStep:
             object.__setattr__(self, "limits", CostLimits(tuple(self.limits)))
         if self.start_limits is not None and not isinstance(self.start_limits, CostLimits):
             object.__setattr__(self, "start_limits", CostLimits(tuple(self.start_limits)))
+        object.__setattr__(self, "policy_noise", float(self.policy_noise))  # perhaps a NumPy number
         if not 0.0 <= self.policy_noise <= 1.0:
             raise ValueError(f"policy noise must lie in [0, 1], got {self.policy_noise}")
+        if self.entropy_coefficient is not None:
+            object.__setattr__(self, "entropy_coefficient", float(self.entropy_coefficient))
         coefficient = self.entropy_coefficient
         if coefficient is not None and not 0.0 <= coefficient < math.inf:
             raise ValueError(f"entropy coefficient must be finite and at least 0, got {coefficient}")

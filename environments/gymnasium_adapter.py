@@ -35,6 +35,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
+from gymnasium.wrappers import TimeLimit
 
 from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
 from recrl.environments.gymnasium_spaces import float32_vectors, integer_check, supported_actions
@@ -371,9 +372,21 @@ def _declared_horizon(environment: Environment) -> int | None:
     if environment.spec is not None and environment.spec.max_episode_steps is not None:
         return environment.spec.max_episode_steps
     horizon = environment.get_wrapper_attr("horizon") if environment.has_wrapper_attr("horizon") else None
-    if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
-        return None
-    return int(horizon)
+    if isinstance(horizon, float) and horizon.is_integer():
+        horizon = int(horizon)
+    if isinstance(horizon, int | np.integer) and not isinstance(horizon, bool) and horizon >= 1:
+        return int(horizon)
+    return _time_limit(environment)
+
+
+def _time_limit(environment: Environment) -> int | None:
+    """Return the smallest limit of Gymnasium's ``TimeLimit`` around an environment, or None without one."""
+    limits = []
+    while isinstance(environment, gymnasium.Wrapper):
+        if isinstance(environment, TimeLimit):
+            limits.append(environment._max_episode_steps)  # there is no public name
+        environment = environment.env
+    return min(limits, default=None)
 
 
 def _declared_components(environment: Environment) -> tuple[ObservationComponent, ...]:
@@ -387,6 +400,14 @@ def _declared_components(environment: Environment) -> tuple[ObservationComponent
                 "observation_components must hold recrl.environments.cmdp.ObservationComponent, got "
                 f"{_brief(component)}"
             )
+    declared = sum(component.size for component in components)
+    inside, size = environment.unwrapped.observation_space, spaces.flatdim(environment.observation_space)
+    if components and declared == spaces.flatdim(inside) != size:
+        raise ValueError(
+            f"a wrapper changes the observation from {declared} to {size} numbers, so the environment's "
+            "observation_components no longer describe it; let the wrapper have observation_components of "
+            "its own, or () for none"
+        )
     return components
 
 

@@ -17,9 +17,11 @@ import os
 import re
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
+from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -47,6 +49,7 @@ _refused = ContextVar("_refused", default=False)  # of a thread: others may foll
 # Folders of modules: that of the parent process, and those of the open blocks of ``modules_in``.
 _folders = [os.environ[MODULES]] if MODULES in os.environ else []
 _appended: set[str] = set()  # folders that import_module has appended to sys.path
+_imported: dict[str, tuple[ModuleSpec, bytes]] = {}  # by a module's name: how it was found, and its source
 _changing = threading.Lock()
 
 
@@ -127,15 +130,44 @@ def modules_folder() -> str | None:
 def import_module(name: str) -> ModuleType:
     """Import a module by its dotted name, also from the folder of ``modules_in``.
 
+    If the file of a module has changed since this process imported it, that is a warning: the code of before
+    runs.
+
     Raises:
-        ImportError: it cannot be imported.
+        ImportError: it cannot be imported; or this process imported it from another folder than the one in
+            which it is found now.
     """
     folder = os.environ.get(MODULES)
     with _changing:
         if folder and folder not in sys.path and not name.startswith("recrl."):
             sys.path.append(folder)
             _appended.add(folder)
-    return importlib.import_module(name)
+    module = importlib.import_module(name)
+    _require_newest(module)
+    return module
+
+
+def _require_newest(module: ModuleType) -> None:
+    """Raise ImportError if a module is found in another folder than before; warn if its file has changed."""
+    name, spec = module.__name__, module.__spec__
+    if spec is None or spec.origin is None or not Path(spec.origin).is_file():
+        return
+    top = sys.modules.get(name.partition(".")[0], module).__spec__
+    found = PathFinder.find_spec(top.name) if top is not None else None
+    if found is not None and top is not None and found.origin not in (None, top.origin):
+        raise ImportError(
+            f"this process imported {top.name} from {top.origin}, and now {found.origin} is found; start a "
+            "new Python process"
+        )
+    now = Path(spec.origin).read_bytes()
+    if _imported.setdefault(name, (spec, now))[0] is not spec:  # it was reloaded
+        _imported[name] = (spec, now)
+    if _imported[name][1] != now:
+        warnings.warn(
+            f"{spec.origin} has changed since this process imported it; the code of before runs until you "
+            f"start a new Python process or call importlib.reload(sys.modules[{name!r}])",
+            stacklevel=3,
+        )
 
 
 def load_attribute(path: str) -> Any:

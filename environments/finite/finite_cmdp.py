@@ -72,12 +72,14 @@ class FiniteCMDP:
         if self.successors.min() < 0 or self.successors.max() >= self.num_states:
             raise ValueError(f"successors must be states 0 to {self.num_states - 1}")
         for name, rows in (("probabilities", self.probabilities), ("start", self.start)):
-            if rows.min() < 0.0 or not np.allclose(rows.sum(axis=-1), 1.0):
+            if not rows.min() >= 0.0 or not np.allclose(rows.sum(axis=-1), 1.0):
                 raise ValueError(f"{name} must be at least 0 and sum to 1")
         if self.start[self.terminal].any():
             raise ValueError("an episode must not start in a terminal state")
-        if self.costs.min() < 0.0:
-            raise ValueError(f"costs must be at least 0, got {self.costs.min()}")
+        if not np.isfinite(self.rewards).all():
+            raise ValueError("rewards must be finite numbers")
+        if not (self.costs.min() >= 0.0 and np.isfinite(self.costs).all()):
+            raise ValueError(f"costs must be finite and at least 0, got {self.costs.min()}")
         if self.horizon < 1:
             raise ValueError(f"the horizon must be at least 1 step, got {self.horizon}")
 

@@ -52,6 +52,19 @@ CostName = Literal["river", "turns", "mud"]
 ObservationName = Literal["factored", "joint"]
 
 
+def require_reach(river_map: RiverMap, horizon: int, name: str) -> None:
+    """Check that an agent can reach a goal of a map in ``horizon`` steps.
+
+    Raises:
+        ValueError: it cannot; the sentence has the smallest horizon.
+    """
+    quickest = quickest_route(river_map)
+    if quickest is not None and horizon < quickest.steps:
+        raise ValueError(
+            f"horizon must be at least {quickest.steps}, the steps to the goal of {name}, got {horizon}"
+        )
+
+
 class RiverGridOptions(Options):
     """Options of ``rivergrid-1a`` and ``rivergrid-1b``, and common options of the other RiverGrid tasks."""
 
@@ -95,19 +108,18 @@ class RiverGridMapOptions(RiverGridOptions):
         """The map of these settings."""
         return parse_map(self.map)
 
+    @model_validator(mode="after")
+    def _goal_is_in_reach(self) -> Self:
+        require_reach(self.river_map(), self.horizon, "the map")
+        return self
+
 
 class RiverGridGeneratedOptions(RiverGridOptions, InstanceSettings):
     """Options of ``rivergrid-generated``: a random instance with the properties of 1a or 1b."""
 
     @model_validator(mode="after")
     def _goal_is_in_reach(self) -> Self:
-        quickest = quickest_route(self.river_map())
-        assert quickest is not None, "an instance's goal can be reached"
-        if self.horizon < quickest.steps:
-            raise ValueError(
-                f"horizon must be at least {quickest.steps}, the steps to the goal of map {self.map_seed}, "
-                f"got {self.horizon}"
-            )
+        require_reach(self.river_map(), self.horizon, f"map {self.map_seed}")
         return self
 
     def river_map(self) -> RiverMap:

@@ -49,7 +49,7 @@ def kept(compiler: Any, function: Any) -> Any:
 
 
 def salted(function: Any) -> Any:
-    """Return a copy of a function whose stored machine code Numba uses only while ``source_digest`` is the same.
+    """Return a copy of a function whose stored machine code is used only for the same ``source_digest``.
 
     Numba compares what a function's free variables hold, so the digest becomes an unused free variable.
     """

@@ -120,12 +120,13 @@ def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
     """Return the curriculum: a method of the sweep by its label, or any curriculum by its name."""
     known = {spec.method.label: spec.method for spec in store.specs()}
     method = known.get(request.teacher, Choice(request.teacher))
-    options = dict(method.options)
+    changed = {}
     for pair in request.option:
         key, equals, value = pair.partition("=")
         if not equals:
             raise RecrlError(f"--option: must look like window=8, got {pair!r}")
-        options[key] = _parsed(value)
+        changed[key] = _parsed(value)
+    options = {**(_chosen(method) if "preset" in changed else method.options), **changed}
     try:
         require_json(options)
         teacher_config(method.name, options)
@@ -144,6 +145,13 @@ def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
     except USERS_ERRORS as error:
         raise RecrlError(f"teacher {method.name!r} cannot be used: {described(error)}") from error
     return Choice(method.name, options, method.label)
+
+
+def _chosen(method: Choice) -> dict[str, Any]:
+    """Return the options of a method that differ from the defaults of its preset."""
+    preset = {"preset": method.options["preset"]} if "preset" in method.options else {}
+    defaults = teacher_config(method.name, preset).model_dump()
+    return {key: value for key, value in method.options.items() if value != defaults.get(key)}
 
 
 def _parsed(text: str) -> Any:

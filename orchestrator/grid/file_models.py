@@ -49,7 +49,7 @@ def _read_limits(value: Any) -> tuple[float, ...]:
             raise ValueError(f"must be numbers of at least 0 (cost per episode), got {as_written(limit)}")
         if isinstance(limit, int) and limit > sys.float_info.max:
             raise ValueError(f"must be at most {sys.float_info.max:.1e}, got {as_written(limit)}")
-    return tuple(float(limit) for limit in values)
+    return tuple(float(limit) + 0.0 for limit in values)  # 0 for -0.0, which would be another trial
 
 
 def _read_train_limits(value: Any) -> tuple[float, ...]:

@@ -21,7 +21,7 @@ import functools
 import importlib.machinery
 import importlib.util
 import sys
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from importlib.machinery import ModuleSpec
 from importlib.metadata import entry_points
@@ -54,16 +54,21 @@ KINDS = (
 )
 
 
+# By package: how this process found it (None before its import), its files, and the digests.
+_ran: dict[str, tuple[ModuleSpec | None, dict[str, Path], dict[str, str]]] = {}
+
+
 class InstalledCode:
     """The code that is installed now; each package is read once, for many trials.
 
     Attributes:
         libraries: versions of ``LIBRARIES``.
+        digests_of: of a top-level package or module, and of those of its project that it imports.
     """
 
     def __init__(self) -> None:
         self._module_of = functools.cache(_module_of)
-        self._digests_of = functools.cache(_digests_of)
+        self.digests_of: Callable[[str], dict[str, str]] = functools.cache(_digests_of)
         self.libraries = _without_builds(package_versions(LIBRARIES))
 
     def of(self, spec: TrialSpec) -> dict[str, str]:
@@ -81,13 +86,19 @@ class InstalledCode:
             if isinstance(network := choice.options.get("network"), str):
                 names.append(network)
             for name in filter(None, names):
-                found |= self._digests_of(name.partition(":")[0].partition(".")[0])
+                found |= self.digests_of(name.partition(":")[0].partition(".")[0])
         return found
 
 
 def code_of(spec: TrialSpec) -> dict[str, str]:
-    """Return ``InstalledCode.of`` one trial."""
-    return InstalledCode().of(spec)
+    """Return ``InstalledCode.of`` a trial that this process runs now.
+
+    A process imports a package once. So what it ran first is what it runs, although files may have changed
+    since, unless the package was reloaded.
+    """
+    installed = InstalledCode()
+    installed.digests_of = _digests_of_imported
+    return installed.of(spec)
 
 
 @dataclass(frozen=True)
@@ -231,6 +242,17 @@ def _own_digest() -> str:
     if missing := [str(path) for path in trial.values() if not path.is_file()]:
         raise FileNotFoundError(f"{', '.join(missing)}: results depend on it, and it is missing")
     return digest_of_code({**files, **trial})[:16]
+
+
+def _digests_of_imported(package: str) -> dict[str, str]:
+    """Return the digests that this function returned first for a package, unless it was reloaded since."""
+    now: ModuleSpec | None = getattr(sys.modules.get(package), "__spec__", None)
+    first, files, digests = _ran.get(package, (None, {}, {}))
+    was_reloaded = first is not None and first is not now
+    if now is None or was_reloaded or files != _files_of(package):
+        files, digests = _files_of(package), _digests_of(package)
+    _ran[package] = (now, files, digests)
+    return digests
 
 
 def _digests_of(package: str) -> dict[str, str]:

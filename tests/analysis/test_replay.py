@@ -2,6 +2,8 @@
 
 from dataclasses import replace as changed
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from recrl.analysis.figures.curriculum_replay import Replayed, replayed_limits
 from recrl.analysis.report.text_tables import replay_summary
 from recrl.analysis.statistics.curriculum_replay import progress_reports, replay
 from recrl.environments.cmdp import CostLimits
+from recrl.orchestrator.cli.curricula import _teacher
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
@@ -17,6 +20,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.orchestrator.trial.attempt import run_recorded
+from recrl.teachers.registry import teacher_config
 
 SPEC = TrialSpec(
     task=Choice("two-state", {"horizon": 10}),
@@ -108,6 +112,10 @@ def test_the_command_takes_methods_and_options(trial: TrialStore, capsys: pytest
     assert main([*command, "dynamic", "--option", "window=5"]) == ExitCode.OK
     assert len(list((root / "sweep" / "replays").iterdir())) == 6, "other options, other files"
     capsys.readouterr()
+    assert main([*command, "dynamic", "--option", "preset=paper"]) == ExitCode.OK
+    paper = Choice("dynamic", {**trial.spec.method.options, "preset": "paper"}).file_name
+    assert (root / "sweep" / "replays" / f"{paper}.png").exists()
+    capsys.readouterr()
     assert main([*command, "dynamik"]) == ExitCode.WRONG_INPUT
     assert "did you mean 'dynamic'?" in capsys.readouterr().err
     assert main([*command, "dynamic", "--option", "window=0"]) == ExitCode.WRONG_INPUT
@@ -116,6 +124,15 @@ def test_the_command_takes_methods_and_options(trial: TrialStore, capsys: pytest
     assert capsys.readouterr().err == (
         "recrl-sweep: --option: dynamic: windw: unknown key; did you mean 'window'?\n"
     )
+
+
+def test_another_preset_replaces_the_defaults_of_the_one_before(tmp_path: Path) -> None:
+    full = teacher_config("dynamic", {"window": 4}).model_dump()
+    store = SweepStore(tmp_path, "sweep")
+    store.write_specs([changed(SPEC, method=Choice("dynamic", full))])
+    request: Any = SimpleNamespace(teacher="dynamic", option=("preset=paper",))
+    options = _teacher(store, request).options
+    assert teacher_config("dynamic", options) == teacher_config("dynamic", {"preset": "paper", "window": 4})
 
 
 def test_the_figure_shows_what_was_and_what_would_have_been(trial: TrialStore) -> None:

@@ -3,9 +3,10 @@
     python tests/benchmarks/power.py results/safety-gym/agents.csv results/safety-gym/curricula-today.csv
 
 The spread is the standard deviation s of the returns of final policies of one agent and curriculum on a task,
-over seeds and repetitions, pooled over agents and curricula. For n seeds of each of two curricula the table has the
-smallest true difference that a t test at 5% finds with a probability of 80%. With ``--tests N`` the level is
-5% / N (Bonferroni). The trials count as independent. The power is exact, from the noncentral t distribution.
+over seeds and repetitions, pooled over agents and curricula. For n seeds of each of two curricula the table
+has the smallest true difference that a t test at 5% finds with a probability of 80%. With ``--tests N`` the
+level is 5% / N (Bonferroni). The trials count as independent. The power is exact, from the noncentral t
+distribution.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from functools import partial
 from typing import Any, ClassVar
@@ -11,7 +12,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import TimeLimit
 
+from recrl.environments.cmdp import ObservationComponent
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
 from recrl.environments.gymnasium_spaces import float32_vectors
 from recrl.environments.gymnasium_tasks import (
@@ -158,6 +161,38 @@ def test_gymnasiums_own_mujoco_tasks_can_be_made() -> None:
     assert environments.cmdp.horizon == 1000
 
 
+def test_the_horizon_is_that_of_a_time_limit_if_nothing_else_says_it() -> None:
+    def limited(*steps: int) -> gymnasium.Env[Any, Any]:
+        return functools.reduce(TimeLimit, steps, Countdown(1000))
+
+    assert SyncCMDPVectorEnv("countdown", [limited]).cmdp.horizon is None
+    assert SyncCMDPVectorEnv("countdown", [partial(limited, 7)]).cmdp.horizon == 7
+    assert SyncCMDPVectorEnv("countdown", [partial(limited, 5, 7)]).cmdp.horizon == 5
+
+
+def test_a_wrapper_that_changes_observations_must_say_what_they_consist_of() -> None:
+    class Declared(gymnasium.Env[Any, Any]):
+        observation_space = spaces.Box(0.0, 1.0, (3,), np.float32)
+        action_space = spaces.Discrete(2)
+        observation_components = (ObservationComponent("lidar", 3, lidar_range=1.0),)
+
+    class Doubled(gymnasium.ObservationWrapper[Any, Any, Any]):
+        def __init__(self, environment: gymnasium.Env[Any, Any], **attributes: Any) -> None:
+            super().__init__(environment)
+            self.observation_space = spaces.Box(0.0, 1.0, (6,), np.float32)
+            vars(self).update(attributes)
+
+        def observation(self, observation: Any) -> Any:
+            return np.tile(observation, 2)
+
+    with pytest.raises(
+        ValueError, match=r"a wrapper changes the observation from 3 to 6 numbers.*or \(\) for none"
+    ):
+        SyncCMDPVectorEnv("declared", [lambda: Doubled(Declared())])
+    plain = SyncCMDPVectorEnv("declared", [lambda: Doubled(Declared(), observation_components=())])
+    assert plain.cmdp.components == ()
+
+
 @pytest.mark.parametrize(
     ("attribute", "spec_horizon", "horizon"),
     [
@@ -165,6 +200,7 @@ def test_gymnasiums_own_mujoco_tasks_can_be_made() -> None:
         (30, None, 30),
         (np.int64(30), None, 30),
         (30, 20, 20),
+        (30.0, None, 30),
         ("far", None, None),
         (0, None, None),
     ],

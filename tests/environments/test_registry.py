@@ -74,6 +74,10 @@ def test_all_mistakes_in_options_are_reported_at_once() -> None:
         ({"map": "####\n#>.#\n####"}, "map: needs a goal 'G'"),
         ({"map": "no/such/map.txt"}, "no/such/map.txt: cannot be read as a map"),
         ({"map": MAPS["1a"], "costs": ["river", "river"]}, "must differ, got river, river"),
+        (
+            {"map": "######\n#>..G#\n######", "horizon": 2},
+            "at least 3, the steps to the goal of the map, got 2",
+        ),
     ],
 )
 def test_maps_that_cannot_be_used_are_found_when_options_are_checked(
@@ -174,6 +178,25 @@ def test_folders_of_modules_may_overlap_in_several_threads(
     assert load_attribute("late_room:make")
     second.__exit__(None, None, None)
     assert (os.environ.get(MODULES), sys.path) == (None, before)
+
+
+def test_a_module_of_the_same_name_in_another_folder_is_not_confused_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "my_twin.py").write_text(f"NAME = {name!r}\n")
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    with modules_in(tmp_path / "one"):
+        assert load_attribute("my_twin:NAME") == "one"
+    try:
+        with (
+            modules_in(tmp_path / "two"),
+            pytest.raises(UnknownNameError, match="start a new Python process"),
+        ):
+            load_attribute("my_twin:NAME")
+    finally:
+        del sys.modules["my_twin"]
 
 
 @pytest.mark.parametrize(

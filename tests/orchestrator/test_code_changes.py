@@ -14,6 +14,7 @@ import pytest
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.sweep_warnings import curriculum_flags
 from recrl.analysis.report import drawing
+from recrl.environments.plugins import import_module
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.executors import Executor, InlineExecutor
@@ -26,6 +27,7 @@ from recrl.orchestrator.launch_plan import PlannedAction, TrialSelection, make_p
 from recrl.orchestrator.provenance import code_changes, versions
 from recrl.orchestrator.provenance.code_changes import (
     CodeComparison,
+    InstalledCode,
     code_of,
     compare,
     compare_files,
@@ -331,6 +333,21 @@ def test_the_code_of_a_task_is_found_without_running_it(folder: Path) -> None:
     assert "my_scaled_task" not in sys.modules
 
 
+def test_a_process_goes_on_with_the_code_that_it_imported_and_says_so(folder: Path) -> None:
+    (spec,) = read_grid(folder / "grid.yaml").trials()
+    sys.modules.pop("my_scaled_task", None)
+    before = code_of(spec)
+    import_module("my_scaled_task")
+    (folder / "my_scaled_task.py").write_text(TASK + "LATER = 1\n")
+    with pytest.warns(UserWarning, match="has changed since this process imported it"):
+        module = import_module("my_scaled_task")
+    assert code_of(spec) == before
+    assert compare([{"code": before}], spec).differs, "a later launch says that the code is another one"
+    importlib.reload(module)
+    import_module("my_scaled_task")
+    assert code_of(spec) != before
+
+
 def test_modules_that_a_plug_in_imports_are_among_its_code(folder: Path) -> None:
     (spec,) = read_grid(folder / "grid.yaml").trials()
     own = "import json\nimport numpy as np\nfrom my_physics import GRAVITY\n" + TASK
@@ -340,10 +357,10 @@ def test_modules_that_a_plug_in_imports_are_among_its_code(folder: Path) -> None
     (folder / "my_units" / "lengths.py").write_text("import my_scaled_task  # a circle\n")
     (folder / "my_other.py").write_text("")  # nobody imports it
     importlib.invalidate_caches()
-    before = code_of(spec)
+    before = InstalledCode().of(spec)
     assert list(before) == ["recrl", "my_scaled_task", "my_physics", "my_units"]
     (folder / "my_units" / "lengths.py").write_text("METRE = 2\n")
-    after = code_of(spec)
+    after = InstalledCode().of(spec)
     assert {name for name in before if before[name] != after[name]} == {"my_units"}
     assert compare([{"code": before}], spec).differs
     old = {name: before[name] for name in ("recrl", "my_scaled_task")}  # what earlier versions wrote
@@ -361,9 +378,9 @@ def test_the_imports_of_a_plug_in_are_followed_within_its_project_and_bounds(
     elsewhere = tmp_path_factory.mktemp("elsewhere")
     (elsewhere / "my_elsewhere.py").write_text("")
     monkeypatch.syspath_prepend(elsewhere)
-    assert list(code_of(spec)) == ["recrl", "my_scaled_task", "my_a", "my_b"]
+    assert list(InstalledCode().of(spec)) == ["recrl", "my_scaled_task", "my_a", "my_b"]
     monkeypatch.setattr(code_changes, "MOST_FILES", 2)
-    assert list(code_of(spec)) == ["recrl", "my_scaled_task", "my_a"]
+    assert list(InstalledCode().of(spec)) == ["recrl", "my_scaled_task", "my_a"]
 
 
 def test_of_a_package_that_is_not_here_it_is_said_that_it_was_not_compared(

@@ -7,6 +7,7 @@ import sys
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
@@ -126,6 +127,20 @@ def test_a_spec_that_makes_no_sense_is_refused(
     with pytest.raises(ValueError) as error:
         TeacherSpec("linear", {}, CostLimits(train), CostLimits(deploy), train_steps)
     assert str(error.value) == message
+
+
+def test_plain_and_numpy_numbers_become_what_json_can_hold() -> None:
+    spec = TeacherSpec("linear", {}, (50.0,), np.array([5.0]), 100)  # type: ignore[arg-type]
+    assert spec.train_limits == CostLimits((50.0,)) and spec.deploy_limits == CostLimits((5.0,))
+    step = CurriculumStep(CostLimits((-0.0,)), np.float32(0.5), np.float32(0.25))  # type: ignore[arg-type]
+    assert json.dumps(step.to_json()) == (
+        '{"limits": [0.0], "policy_noise": 0.5, "entropy_coefficient": 0.25, "start_limits": null}'
+    )
+
+
+def test_text_is_no_list_of_limits() -> None:
+    with pytest.raises(ValueError, match=r"^cost limits must be numbers, got '55'$"):
+        CostLimits("55")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("noise", [-0.1, 1.1])
