@@ -72,9 +72,10 @@ def return_against_cost(sweep: Sweep) -> Figure | None:
                 for limit in sorted(set(chosen[LIMIT])):
                     axes.axvline(limit, color=LIMIT_COLOUR, linewidth=1.1, linestyle=panels.DASHED)
                     axes.axvspan(limit, far, **panels.ABOVE_LIMIT)
-                axes.set_title(f"{task}, {agent}", loc="left", pad=3.0)
                 axes.set_xlabel(f"episode cost{cost_suffix(sweep, i, task)}")
-            line[0].set_ylabel("return")
+            line[0].set_ylabel(f"{task}\nreturn")
+        for axes, agent in zip(grid[0], agents, strict=True):
+            axes.set_title(agent, pad=4.0)
         present = [method for method in look if (rows["method"] == method).any()]
         _legend(figure, look, present, known=known, clipped=clipped)
     return figure
