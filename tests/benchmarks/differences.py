@@ -7,8 +7,9 @@
 Tables are those of ``final_policies.py``. With ``--control`` each group is the seeds of one agent on one
 task, and the groups are independent; a task without a control is left out. With one agent a task the last
 line averages the tasks' differences, with the variance within groups pooled. With ``--against`` the control
-is that curriculum in the same tables, and trials are paired by seed. The p values are corrected for all rows
-that are printed, by Holm's method.
+is that curriculum in the same tables, and trials are paired by seed. With ``--limit`` only policies count
+whose mean cost is at most one standard error, over episodes, above it. The p values are corrected for all
+rows that are printed, by Holm's method.
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ from recrl.environments.cmdp import Floats
 CONFIDENCE = 0.95
 
 
-def read(paths: Sequence[Path], policy: str) -> pd.DataFrame:
-    """The rows of one kind of policy."""
+def read(paths: Sequence[Path], policy: str, limit: float) -> pd.DataFrame:
+    """The rows of one kind of policy that keep a limit."""
     rows = pd.concat([pd.read_csv(path, comment="#") for path in paths], ignore_index=True)
-    return rows[rows["policy"] == policy]
+    kept = rows["cost"] <= limit + rows["cost_se"] if math.isfinite(limit) else True
+    return rows[(rows["policy"] == policy) & kept]
 
 
 def difference(values: Floats, control: Floats) -> tuple[float, float, float, float]:
@@ -111,14 +113,15 @@ def main() -> None:
     control_options.add_argument("--control", type=Path, nargs="+")
     control_options.add_argument("--against", metavar="CURRICULUM")
     parser.add_argument("--policy", default="stochastic")
+    parser.add_argument("--limit", type=float, default=math.inf, help="of the cost; default: none")
     arguments = parser.parse_args()
-    rows = read(arguments.tables, arguments.policy)
+    rows = read(arguments.tables, arguments.policy, arguments.limit)
     if arguments.against is not None:
         for column in ("return", "cost"):
             print(f"{column}: paired difference, 95% interval, p, p corrected for all rows")
             print(paired_differences(rows, arguments.against, column).round(3).to_string(index=False))
         return
-    control = read(arguments.control, arguments.policy)
+    control = read(arguments.control, arguments.policy, arguments.limit)
     rows = rows[rows["task"].isin(control["task"])]
     one_agent = bool((rows.groupby("task")["agent"].nunique() == 1).all())
     for column in ("return", "cost"):

@@ -467,6 +467,8 @@ SHIPPED = {
     "safety-gym-agents": 27,
     "safety-gym-curricula": 54,
     "safety-gym-table": 90,
+    "safety-gym-level1": 54,
+    "safety-gym-controls": 27,
     "velocity": 180,
     "velocity-curricula": 180,
 }
