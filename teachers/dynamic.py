@@ -151,10 +151,10 @@ def decide(
     kept = _kept(new, limits, config)
     if config.dimensions == "joint":
         kept = [all(kept)] * len(limits)
-    is_stuck = any(settled and not keeps for settled, keeps in zip(converged, kept, strict=True))
+    is_stuck = any(has_converged and not keeps for has_converged, keeps in zip(converged, kept, strict=True))
     lowered = tuple(
-        next_limit(limit, cost, deploy, remaining=remaining) if settled and keeps else limit
-        for limit, cost, deploy, settled, keeps in zip(
+        next_limit(limit, cost, deploy, remaining=remaining) if has_converged and keeps else limit
+        for limit, cost, deploy, has_converged, keeps in zip(
             limits, new.mean_costs, deploy_limits, converged, kept, strict=True
         )
     )

@@ -51,16 +51,16 @@ def acceptance(
         target_kl: delta.
     """
     before = model.old_surrogates()
-    judged = np.ones(len(active.index), dtype=np.bool_)
+    checked = np.ones(len(active.index), dtype=np.bool_)
     if solution.case is StepCase.RECOVERY:
-        judged = active.violations <= 0.0
-        judged[list(solution.recovered)] = True
+        checked = active.violations <= 0.0
+        checked[list(solution.recovered)] = True
     reward_may_fall = bool(np.any(active.violations > 0.0))
     allowed = before[1 + active.index] + np.maximum(-active.violations, 0.0)
 
     def is_acceptable() -> bool:
         now, divergence = model.surrogates_and_divergence()
-        costs_keep = bool(np.all((now[1 + active.index] <= allowed)[judged]))
+        costs_keep = bool(np.all((now[1 + active.index] <= allowed)[checked]))
         reward_keeps = reward_may_fall or bool(now[0] >= before[0])
         return costs_keep and reward_keeps and divergence <= target_kl
 

@@ -248,7 +248,7 @@ def checked_module(factory: ModuleFactory, num_inputs: int, num_outputs: int, *,
             "running statistics, such as LayerNorm instead of BatchNorm"
         )
     if not list(module.parameters()):
-        raise NetworkError("the network has no parameters")
+        raise NetworkError("the network has no parameters: give it a layer that is learnt")
     frozen = [name for name, parameter in module.named_parameters() if not parameter.requires_grad]
     if frozen:
         raise NetworkError(

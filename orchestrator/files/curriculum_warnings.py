@@ -23,7 +23,7 @@ def landed_hard(spec: TrialSpec, events: Iterable[str]) -> bool:
 
 def no_curriculum_sentence(titles: Sequence[str]) -> str:
     """Return the warning about trials whose measured d_t is not above d_d; empty for none."""
-    what = "the measured d_t is not above d_d, so that the curriculum is none"
+    what = "the measured d_t is not above d_d, so the curriculum has no effect"
     return _warning(what, titles, "give a finite train_limits above d_d")
 
 

@@ -87,17 +87,17 @@ def learnt(agent: str, task: str, options: dict[str, Any]) -> bytes:
 def _learnt(agent: str, task: str, options_json: str) -> bytes:
     options = json.loads(options_json)
     environments = make_vector(task, 4)
-    student = make_agent(agent, environments.cmdp, options, np.random.SeedSequence(7))
+    learner = make_agent(agent, environments.cmdp, options, np.random.SeedSequence(7))
     collector, generator = Collector(environments, num_steps=20), np.random.default_rng(2)
     collector.reset(seed=1)
     num_costs = environments.cmdp.num_costs
     for limit in (4.0, 0.5):
-        rollout, episodes = collector.collect(student, generator)
+        rollout, episodes = collector.collect(learner, generator)
         if limit == 0.5:
-            student.add_noise(0.3, rollout.observations.reshape(-1, rollout.observations.shape[-1]))
+            learner.add_noise(0.3, rollout.observations.reshape(-1, rollout.observations.shape[-1]))
         limits = CostLimits((limit,) * num_costs)
-        student.update(rollout, episode_costs(episodes, num_costs), CurriculumStep(limits))
-    return encode(student.state_dict())
+        learner.update(rollout, episode_costs(episodes, num_costs), CurriculumStep(limits))
+    return encode(learner.state_dict())
 
 
 @pytest.mark.parametrize("agent", AGENTS)

@@ -160,13 +160,13 @@ def test_a_policy_that_noise_made_uniform_learns_again(options: dict[str, Any], 
 
 def trained(agent: str, task: str, options: dict[str, Any], *, updates: int = 3) -> Any:
     environments = make_vector(task, 4)
-    student = make_agent(agent, environments.cmdp, {"critic_steps": 5, **options}, np.random.SeedSequence(7))
+    learner = make_agent(agent, environments.cmdp, {"critic_steps": 5, **options}, np.random.SeedSequence(7))
     collector, generator = Collector(environments, num_steps=20), np.random.default_rng(2)
     collector.reset(seed=1)
     for _ in range(updates):
-        rollout, episodes = collector.collect(student, generator)
-        student.update(rollout, episode_costs(episodes, 1), CurriculumStep(CostLimits((1.0,))))
-    return student
+        rollout, episodes = collector.collect(learner, generator)
+        learner.update(rollout, episode_costs(episodes, 1), CurriculumStep(CostLimits((1.0,))))
+    return learner
 
 
 @pytest.mark.parametrize("agent", AGENTS)
@@ -220,7 +220,7 @@ def with_a_frozen_layer(num_inputs: int, num_outputs: int) -> nn.Module:
         (no_module, "the network's factory returned a int, not a torch.nn.Module"),
         (of_another_shape, r"to torch.float32 \[2, 3\]: it must return float32 \[2, 2\]"),
         (with_statistics, "the network has buffers .*use layers without running statistics"),
-        (lambda _, __: nn.Identity(), "the network has no parameters"),
+        (lambda _, __: nn.Identity(), "the network has no parameters: give it a layer that is learnt"),
         (lambda _, outputs: nn.Linear(99, outputs), r"failed on float32 \[2, 4\]"),
         (lambda only: nn.Linear(only, 2), r"\(4, 2\) failed"),
         (mixed_rows, "depends on the other rows"),

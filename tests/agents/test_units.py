@@ -35,20 +35,20 @@ def learnt(
     """The actions' probabilities, or the modes, of an agent whose rewards and costs are multiplied."""
     environments = make_vector(task, 8)
     options = {"hidden_sizes": [16, 16], **options}
-    student = make_agent(agent, environments.cmdp, options, np.random.SeedSequence(7))
+    learner = make_agent(agent, environments.cmdp, options, np.random.SeedSequence(7))
     collector, generator = Collector(environments, num_steps=40), np.random.default_rng(2)
     collector.reset(seed=1)
     step = CurriculumStep(CostLimits((cost * LIMITS[task],) * environments.cmdp.num_costs))
     for _ in range(updates):
-        rollout, episodes = collector.collect(student, generator)
+        rollout, episodes = collector.collect(learner, generator)
         scaled = replace(
             rollout,
             rewards=reward * rollout.rewards,
             costs=cost * rollout.costs,
             carried_costs=cost * rollout.carried_costs,
         )
-        student.update(scaled, cost * episode_costs(episodes, environments.cmdp.num_costs), step)
-    policy: npt.NDArray[np.float32] = student.state_dict()["policy"]
+        learner.update(scaled, cost * episode_costs(episodes, environments.cmdp.num_costs), step)
+    policy: npt.NDArray[np.float32] = learner.state_dict()["policy"]
     return policy
 
 

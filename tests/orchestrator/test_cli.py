@@ -45,7 +45,7 @@ methods: [none, linear]
 seeds: 1
 run: {total_steps: 160, deploy_fraction: 0.5, num_envs: 4, rollout_steps: 10, evaluation_episodes: 2}
 """
-UNLUCKY_STUDENT = """\
+UNLUCKY_AGENT = """\
 from recrl.agents.algorithms.own_options import PPOLagConfig
 from recrl.agents.registry import AgentEntry
 
@@ -235,10 +235,10 @@ def test_only_some_trials(folder: Path, capsys: pytest.CaptureFixture[str]) -> N
 def test_failed_trials_are_named_with_their_log(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (folder / "my_unlucky_student.py").write_text(UNLUCKY_STUDENT)
+    (folder / "my_unlucky_agent.py").write_text(UNLUCKY_AGENT)
     monkeypatch.syspath_prepend(folder)
     (folder / "grid.yaml").write_text(
-        GRID.replace("[ppo-lag]", "[{name: 'my_unlucky_student:ENTRY', label: unlucky}]")
+        GRID.replace("[ppo-lag]", "[{name: 'my_unlucky_agent:ENTRY', label: unlucky}]")
     )
     assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.TRIALS_FAILED
     trial = SweepStore(Path("runs"), "small").trials()[0].folder.name
@@ -255,10 +255,10 @@ def test_an_error_without_a_text_fails_its_trial(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     silent = "class Silent(Exception):\n    def __str__(self): return self.text\n\n"
-    own = UNLUCKY_STUDENT.replace("def make", f"{silent}def make").replace("ArithmeticError", "Silent")
-    (folder / "my_silent_student.py").write_text(own)
+    own = UNLUCKY_AGENT.replace("def make", f"{silent}def make").replace("ArithmeticError", "Silent")
+    (folder / "my_silent_agent.py").write_text(own)
     monkeypatch.syspath_prepend(folder)
-    (folder / "grid.yaml").write_text(GRID.replace("ppo-lag", "'my_silent_student:ENTRY'"))
+    (folder / "grid.yaml").write_text(GRID.replace("ppo-lag", "'my_silent_agent:ENTRY'"))
     assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.TRIALS_FAILED
     assert "none seed 0: Silent: its text cannot be read\n" in capsys.readouterr().out
 
@@ -266,9 +266,9 @@ def test_an_error_without_a_text_fails_its_trial(
 def test_no_password_is_printed(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (folder / "my_unlucky_student.py").write_text(UNLUCKY_STUDENT)
+    (folder / "my_unlucky_agent.py").write_text(UNLUCKY_AGENT)
     monkeypatch.syspath_prepend(folder)
-    (folder / "grid.yaml").write_text(GRID.replace("ppo-lag", "'my_unlucky_student:ENTRY'"))
+    (folder / "grid.yaml").write_text(GRID.replace("ppo-lag", "'my_unlucky_agent:ENTRY'"))
     uri = "postgresql://me:hunter2@database/mlflow"
     assert main(["launch", "grid.yaml", *INLINE, "--tracking-uri", uri]) == ExitCode.TRIALS_FAILED
     out = capsys.readouterr().out

@@ -465,7 +465,7 @@ def test_the_sentences_count() -> None:
     )
     assert no_curriculum_sentence([]) == ""
     assert no_curriculum_sentence([f"t{i}" for i in range(7)]) == (
-        "the measured d_t is not above d_d, so that the curriculum is none: t0, t1, t2, t3, t4 and 2 more; "
+        "the measured d_t is not above d_d, so the curriculum has no effect: t0, t1, t2, t3, t4 and 2 more; "
         "give a finite train_limits above d_d"
     )
 
@@ -490,7 +490,7 @@ def test_a_curriculum_that_is_none_is_an_event_and_a_warning(
     capsys.readouterr()
     assert main(["status", "--brief"]) == ExitCode.OK
     sentence = (
-        "the measured d_t is not above d_d, so that the curriculum is none: two-state ppo-lag linear seed 0, "
+        "the measured d_t is not above d_d, so the curriculum has no effect: two-state ppo-lag linear seed 0, "
         "two-state ppo-lag dynamic seed 0; give a finite train_limits above d_d"
     )
     assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"

@@ -36,7 +36,7 @@ run: {total_steps: 120, num_envs: 4, rollout_steps: 10, evaluation_episodes: 2}
 """
 
 # A user's own agent that breaks down as long as a file called "broken" is in the working directory.
-FRAGILE_STUDENT = """\
+FRAGILE_AGENT = """\
 from pathlib import Path
 from recrl.agents.algorithms.own_options import PPOLagConfig
 from recrl.agents.algorithms.ppo_lag import make_ppo_lag
@@ -157,11 +157,11 @@ def test_a_stopped_sweep_goes_on_with_the_same_call(store: SweepStore, tmp_path:
 def test_one_trial_that_fails_leaves_the_others_alone(
     store: SweepStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "my_fragile_student.py").write_text(FRAGILE_STUDENT)
+    (tmp_path / "my_fragile_agent.py").write_text(FRAGILE_AGENT)
     (tmp_path / "broken").touch()
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
-    agent = "{name: 'my_fragile_student:ENTRY', label: fragile}"
+    agent = "{name: 'my_fragile_agent:ENTRY', label: fragile}"
     grid = _grid(GRID.replace("[ppo-lag]", f"[{agent}, ppo-lag]").replace("[none, linear]", "[none]"))
     result = _launch(store, grid)
     assert [trial.spec.agent.label for trial in result.failed] == ["fragile"]
