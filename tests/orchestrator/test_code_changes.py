@@ -490,8 +490,8 @@ def test_a_curriculum_that_is_none_is_an_event_and_a_warning(
     capsys.readouterr()
     assert main(["status", "--brief"]) == ExitCode.OK
     sentence = (
-        "the measured d_t is not above d_d, so the curriculum has no effect: two-state ppo-lag linear seed 0, "
-        "two-state ppo-lag dynamic seed 0; give a finite train_limits above d_d"
+        "the measured d_t is not above d_d, so the curriculum has no effect: two-state ppo-lag linear "
+        "seed 0, two-state ppo-lag dynamic seed 0; give a finite train_limits above d_d"
     )
     assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"
     assert sentence in drawing.missing(sweep_data.load(store))
