@@ -64,6 +64,21 @@ def test_a_rollout_holds_what_happened() -> None:
     assert episodes == (FinishedEpisode(3, 0, 4, 6.0, (3.0,)), FinishedEpisode(3, 1, 4, 6.0, (3.0,)))
 
 
+def test_costs_of_a_batch_must_have_a_column_for_each_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    environments = make_vector("two-state-2", 3)
+    step = environments.step
+
+    def with_one_cost(actions: Any) -> Any:
+        *rest, info = step(actions)
+        return *rest, {**info, "cost": info["cost"][:, :1]}
+
+    monkeypatch.setattr(environments, "step", with_one_cost)
+    collector = Collector(environments, num_steps=2)
+    collector.reset(seed=0)
+    with pytest.raises(ValueError, match=r"a column for each of 2 costs, got the shape \(3, 1\)$"):
+        collector.collect(Constantly(1), np.random.default_rng(0))
+
+
 def test_an_episode_goes_on_across_rollouts() -> None:
     collector = collector_of("two-state-2", num_envs=1, num_steps=3)
     policy, generator = Constantly(2), np.random.default_rng(0)
