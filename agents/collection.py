@@ -141,8 +141,9 @@ class Collector:
             )
             if np.shape(info["cost"]) != costs.shape[1:]:  # NumPy would spread one cost over all
                 raise ValueError(
-                    f"{cmdp.name}: info['cost'] must have a row for each of {environments.num_envs} environments "
-                    f"and a column for each of {cmdp.num_costs} costs, got the shape {np.shape(info['cost'])}"
+                    f"{cmdp.name}: info['cost'] must have a row for each of {environments.num_envs} "
+                    f"environments and a column for each of {cmdp.num_costs} costs, got the shape "
+                    f"{np.shape(info['cost'])}"
                 )
             costs[step] = info["cost"]
             current = observation_rows(cmdp.observation_space, following)
