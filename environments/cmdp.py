@@ -124,8 +124,8 @@ class CostLimits:
     values: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if isinstance(self.values, str):
-            raise ValueError(f"cost limits must be numbers, got {self.values!r}")
+        if isinstance(self.values, str) or not isinstance(self.values, Iterable):
+            raise ValueError(f"cost limits must be a list of numbers, got {self.values!r}")
         object.__setattr__(self, "values", tuple(float(value) + 0.0 for value in self.values))  # no -0.0
         if not self.values:
             raise ValueError("cost limits: at least one is needed, got none")
@@ -201,9 +201,9 @@ class CurriculumStep:
 
     def __post_init__(self) -> None:
         if not isinstance(self.limits, CostLimits):  # a user's curriculum may return plain numbers
-            object.__setattr__(self, "limits", CostLimits(tuple(self.limits)))
+            object.__setattr__(self, "limits", CostLimits(self.limits))
         if self.start_limits is not None and not isinstance(self.start_limits, CostLimits):
-            object.__setattr__(self, "start_limits", CostLimits(tuple(self.start_limits)))
+            object.__setattr__(self, "start_limits", CostLimits(self.start_limits))
         object.__setattr__(self, "policy_noise", float(self.policy_noise))  # perhaps a NumPy number
         if not 0.0 <= self.policy_noise <= 1.0:
             raise ValueError(f"policy noise must lie in [0, 1], got {self.policy_noise}")

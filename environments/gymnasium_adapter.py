@@ -11,10 +11,10 @@ Requirements for a scalar environment:
 - It is a function of its seed and its actions: ``reset(seed=...)`` determines an episode.
 
 An environment may name its costs in an attribute ``cost_names``. Its horizon, for the agents' defaults, is
-``spec.max_episode_steps`` or, if that is missing, the number in an attribute ``horizon``. It may describe the
-slices of its flattened observation in ``observation_components``, a sequence of
-``recrl.environments.cmdp.ObservationComponent``; from it agents learn which of them are lidars. Observations
-of any kind are flattened to float32 vectors (``gymnasium.spaces.flatten``), actions clipped to their bounds.
+the smallest of ``spec.max_episode_steps``, a number in an attribute ``horizon``, and the steps of Gymnasium's
+``TimeLimit``. It may describe the slices of its flattened observation in ``observation_components``, a
+sequence of ``recrl.environments.cmdp.ObservationComponent``; from it agents learn which of them are lidars.
+Observations of any kind are flattened to float32 vectors (``gymnasium.spaces.flatten``), actions clipped to their bounds.
 
 Every episode starts with ``reset(seed=...)`` and a new seed drawn here. A checkpoint holds that seed and the
 actions so far, so the environment need not be pickled. Restoring replays them, at most one episode per
@@ -369,24 +369,19 @@ def _are_names(value: object) -> bool:
 
 def _declared_horizon(environment: Environment) -> int | None:
     """Return the steps after which an environment truncates an episode, or None if it does not say."""
-    if environment.spec is not None and environment.spec.max_episode_steps is not None:
-        return environment.spec.max_episode_steps
-    horizon = environment.get_wrapper_attr("horizon") if environment.has_wrapper_attr("horizon") else None
-    if isinstance(horizon, float) and horizon.is_integer():
-        horizon = int(horizon)
-    if isinstance(horizon, int | np.integer) and not isinstance(horizon, bool) and horizon >= 1:
-        return int(horizon)
-    return _time_limit(environment)
-
-
-def _time_limit(environment: Environment) -> int | None:
-    """Return the smallest limit of Gymnasium's ``TimeLimit`` around an environment, or None without one."""
-    limits = []
-    while isinstance(environment, gymnasium.Wrapper):
-        if isinstance(environment, TimeLimit):
-            limits.append(environment._max_episode_steps)  # there is no public name
-        environment = environment.env
-    return min(limits, default=None)
+    declared = environment.get_wrapper_attr("horizon") if environment.has_wrapper_attr("horizon") else None
+    if isinstance(declared, float) and declared.is_integer():
+        declared = int(declared)
+    is_number = isinstance(declared, int | np.integer) and not isinstance(declared, bool) and declared >= 1
+    known = [
+        environment.spec.max_episode_steps if environment.spec else None,
+        declared if is_number else None,
+    ]
+    inner = environment
+    while isinstance(inner, gymnasium.Wrapper):
+        known += [inner._max_episode_steps] if isinstance(inner, TimeLimit) else []  # there is no public name
+        inner = inner.env
+    return min((int(steps) for steps in known if steps is not None), default=None)
 
 
 def _declared_components(environment: Environment) -> tuple[ObservationComponent, ...]:
@@ -401,12 +396,13 @@ def _declared_components(environment: Environment) -> tuple[ObservationComponent
                 f"{_brief(component)}"
             )
     declared = sum(component.size for component in components)
-    inside, size = environment.unwrapped.observation_space, spaces.flatdim(environment.observation_space)
-    if components and declared == spaces.flatdim(inside) != size:
+    size = spaces.flatdim(environment.observation_space) if components else 0
+    is_inner = getattr(environment.unwrapped, "observation_components", None) is not None
+    if declared != size and is_inner and environment.unwrapped is not environment:
         raise ValueError(
-            f"a wrapper changes the observation from {declared} to {size} numbers, so the environment's "
-            "observation_components no longer describe it; let the wrapper have observation_components of "
-            "its own, or () for none"
+            f"the environment's observation_components describe {declared} numbers, and its wrappers give "
+            f"{size}; let the wrapper that changes the observation have observation_components of its own, "
+            "or () for none"
         )
     return components
 

@@ -152,11 +152,14 @@ def _require_newest(module: ModuleType) -> None:
     name, spec = module.__name__, module.__spec__
     if spec is None or spec.origin is None or not Path(spec.origin).is_file():
         return
-    top = sys.modules.get(name.partition(".")[0], module).__spec__
-    found = PathFinder.find_spec(top.name) if top is not None else None
-    if found is not None and top is not None and found.origin not in (None, top.origin):
+    top_name = name.partition(".")[0]
+    top: ModuleSpec | None = getattr(sys.modules.get(top_name), "__spec__", None)
+    if top is None or top.name != top_name:  # __main__
+        return
+    found = PathFinder.find_spec(top_name)
+    if found is not None and found.origin and top.origin and not _is_same_file(found.origin, top.origin):
         raise ImportError(
-            f"this process imported {top.name} from {top.origin}, and now {found.origin} is found; start a "
+            f"this process imported {top_name} from {top.origin}, and now {found.origin} is found; start a "
             "new Python process"
         )
     now = Path(spec.origin).read_bytes()
@@ -168,6 +171,14 @@ def _require_newest(module: ModuleType) -> None:
             f"start a new Python process or call importlib.reload(sys.modules[{name!r}])",
             stacklevel=3,
         )
+
+
+def _is_same_file(one: str, other: str) -> bool:
+    """Whether two paths lead to one file; True if that is unknown, as in an archive."""
+    try:
+        return Path(one).samefile(other)
+    except OSError:
+        return True
 
 
 def load_attribute(path: str) -> Any:

@@ -58,7 +58,7 @@ class TeacherSpec:
     def __post_init__(self) -> None:
         for name in ("train_limits", "deploy_limits"):
             if not isinstance(given := getattr(self, name), CostLimits):  # plain numbers
-                object.__setattr__(self, name, CostLimits(tuple(given)))
+                object.__setattr__(self, name, CostLimits(given))
         if len(self.train_limits) != len(self.deploy_limits):
             raise ValueError(
                 f"train_limits and deploy_limits must have one entry per cost, "

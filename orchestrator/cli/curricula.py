@@ -126,8 +126,8 @@ def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
         if not equals:
             raise RecrlError(f"--option: must look like window=8, got {pair!r}")
         changed[key] = _parsed(value)
-    options = {**(_chosen(method) if "preset" in changed else method.options), **changed}
     try:
+        options = {**(_chosen(method) if "preset" in changed else method.options), **changed}
         require_json(options)
         teacher_config(method.name, options)
     except ValidationError as error:

@@ -1,7 +1,7 @@
 """Detect whether a trial ran other code, or with other versions of libraries, than is installed now.
 
 A trial's results depend on recrl's tasks, agents, curricula and training loop, not on figures or commands:
-only the former are in the digest. Docstrings and comments are not, because they cannot change a result.
+only the former are in the digest. Docstrings and lines with a comment alone are not.
 A user's task, agent or curriculum has a digest of its top-level package (all Python files) or single module.
 Each module of the user's project that it imports, directly or through others, has one too. Nothing is
 imported to find them: import statements are read from the files. So modules in the working directory are
@@ -54,8 +54,9 @@ KINDS = (
 )
 
 
-# By package: how this process found it (None before its import), its files, and the digests.
-_ran: dict[str, tuple[ModuleSpec | None, dict[str, Path], dict[str, str]]] = {}
+CHANGED = "changed since it was imported"  # in place of a digest; equal to none
+# By package and folder: how this process found the modules that it had imported, and the digests.
+_ran: dict[tuple[str, Path | None], tuple[dict[str, ModuleSpec | None], dict[str, str]]] = {}
 
 
 class InstalledCode:
@@ -93,8 +94,8 @@ class InstalledCode:
 def code_of(spec: TrialSpec) -> dict[str, str]:
     """Return ``InstalledCode.of`` a trial that this process runs now.
 
-    A process imports a package once. So what it ran first is what it runs, although files may have changed
-    since, unless the package was reloaded.
+    A process imports a package once. If its files have changed since, ``CHANGED`` is in place of a digest, so
+    that the trial counts as one of other code.
     """
     installed = InstalledCode()
     installed.digests_of = _digests_of_imported
@@ -245,14 +246,24 @@ def _own_digest() -> str:
 
 
 def _digests_of_imported(package: str) -> dict[str, str]:
-    """Return the digests that this function returned first for a package, unless it was reloaded since."""
-    now: ModuleSpec | None = getattr(sys.modules.get(package), "__spec__", None)
-    first, files, digests = _ran.get(package, (None, {}, {}))
-    was_reloaded = first is not None and first is not now
-    if now is None or was_reloaded or files != _files_of(package):
-        files, digests = _files_of(package), _digests_of(package)
-    _ran[package] = (now, files, digests)
-    return digests
+    """Return ``_digests_of`` a package, or ``CHANGED`` where files have changed since this process read them.
+
+    Python imports a module once. So after a change the process runs the code of before, unless all modules
+    that it had imported were reloaded.
+    """
+    digests, place = _digests_of(package), (package, _folder(_files_of(package)))
+    tops = digests.keys() | {package}
+    loaded = {
+        name: module.__spec__
+        for name, module in list(sys.modules.items())
+        if name.partition(".")[0] in tops and hasattr(module, "__spec__")
+    }
+    before, first = _ran.get(place, (loaded, digests))
+    are_reloaded = bool(before) and all(loaded.get(name) is not spec for name, spec in before.items())
+    if digests == first or are_reloaded:
+        _ran[place] = (loaded, digests)
+        return digests
+    return {name: digest if digest == first.get(name) else CHANGED for name, digest in digests.items()}
 
 
 def _digests_of(package: str) -> dict[str, str]:
@@ -317,14 +328,19 @@ def _spec_in_modules_folder(package: str) -> ModuleSpec | None:
 
 def _project_of(package: str, files: Mapping[str, Path]) -> Path | None:
     """Return the folder of the project that holds a top-level package; None if the package is installed."""
-    name, path = next(iter(files.items()))
-    folder = path.resolve().parents[len(Path(name).parts) - 1]
+    folder = _folder(files)
+    assert folder is not None
     if set(files) != {f"{package}.py"}:  # a package: its own folder is below
         folder = folder.parent
     if set(INSTALLED) & set(folder.parts):
         return None
     marked = (it for it in (folder, *folder.parents) if any((it / name).exists() for name in PROJECT_FILES))
     return next(marked, folder)
+
+
+def _folder(files: Mapping[str, Path]) -> Path | None:
+    """Return the folder that files by their names within it are in; None without files."""
+    return next((path.resolve().parents[len(Path(name).parts) - 1] for name, path in files.items()), None)
 
 
 def _is_in_project(path: Path, project: Path) -> bool:

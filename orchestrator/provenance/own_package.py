@@ -32,9 +32,9 @@ def digest_of_files(files: Mapping[str, Path]) -> str:
 
 
 def digest_of_code(files: Mapping[str, Path]) -> str:
-    """Return 64 hex digits that change with the code in files: docstrings and comments do not count.
+    """Return 64 hex digits that change with the code in files.
 
-    Of files that are not Python every byte counts.
+    Docstrings and lines with a comment alone do not count. Of files that are not Python every byte counts.
     """
     python = {name: path for name, path in files.items() if path.suffix == ".py"}
     others = {name: path for name, path in files.items() if name not in python}

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ast
+import io
+import tokenize
+import warnings
 from collections.abc import Iterator
 
 Place = tuple[int, int]  # a line, from 1, and a byte of it, from 0
@@ -12,16 +15,22 @@ DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 def without_documentation(source: bytes) -> bytes:
     r"""Return Python source without docstrings, blank lines and lines that only have a comment.
 
-    A comment behind code stays. What does not parse is returned as it is.
+    A comment behind code stays. What does not parse, or names ``__doc__``, is returned as it is.
 
     >>> without_documentation(b'def f():\n    "Return 1."\n    # always\n    return 1\n')
     b'def f():\n    return 1'
     """
+    if b"__doc__" in source:
+        return source
     try:
-        tree = ast.parse(source)
+        encoding, _ = tokenize.detect_encoding(io.BytesIO(source).readline)
+        source_text = source.decode(encoding)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of an escape sequence in the user's file
+            tree = ast.parse(source_text)
     except (SyntaxError, ValueError, RecursionError):
         return source
-    lines = source.splitlines()
+    lines = source_text.encode().splitlines()  # ast counts bytes of UTF-8
     nodes = list(ast.walk(tree))
     inside_text = {number for first, last in _long_strings(nodes) for number in range(first + 1, last + 1)}
     for (first, begin), (last, end) in _docstrings(nodes):

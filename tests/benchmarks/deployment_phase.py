@@ -4,7 +4,8 @@
     python tests/benchmarks/differences.py rows.csv --against none --policy phase
 
 A sweep is a folder or an export. A row is a trial and a period, with the mean return and cost of the episodes
-that finished in it: the whole ``phase``, its ``first`` and its ``last`` 100,000 steps.
+that finished in it: the whole ``phase``, its ``first`` and its ``last`` 100,000 steps. Episodes that finish
+soon after the phase has begun, began before it.
 """
 
 from __future__ import annotations

@@ -76,7 +76,8 @@ def perceptron(inputs: int) -> nn.Sequential:
 
 def episodes(trial: Path) -> tuple[CMDPSpec, Rows, Rows]:
     """Run the final policy: observations [T, E, n] and costs [T, E] of E whole episodes."""
-    environments = make_vector(TrialStore(trial).spec.task.name, EPISODES // 3)
+    task = TrialStore(trial).spec.task
+    environments = make_vector(task.name, EPISODES // 3, options=task.options)
     collector = Collector(environments, num_steps=environments.cmdp.horizon or 1)
     collector.reset(seed=0)
     policy, generator = recrl.load_policy(trial).final, np.random.default_rng(0)

@@ -33,7 +33,7 @@ from recrl.environments.registry import make_vector, optimal_return
 AGENTS = ("ppo-lag", "cpo", "trpo-lag", "pcpo", "focops", "p3o", "ipo", "crpo")
 POLICIES = ("final", "last", "mixture")
 # East along the river: the goal in 3 steps, 2 of them in the river. North: in 6 steps, 2 in the mud. First
-# north, then east: in 17 steps, without cost. With both costs limited the optimum takes all three ways.
+# north, then east: in 18 steps, without cost. With both costs limited the optimum takes all three ways.
 GATES = """
     ##################
     #G################

@@ -25,7 +25,10 @@ def power(difference: float, seeds: int, level: float) -> float:
     """Return the power of a two-sided t test of two groups; the difference is in standard deviations."""
     degrees, shift = 2 * seeds - 2, difference * math.sqrt(seeds / 2.0)
     critical = stats.t.ppf(1.0 - level / 2.0, degrees)
-    return float(1.0 - stats.nct.cdf(critical, degrees, shift) + stats.nct.cdf(-critical, degrees, shift))
+    wrong_sign = float(stats.nct.cdf(-critical, degrees, shift))  # NaN where it is nearly 0
+    return float(1.0 - stats.nct.cdf(critical, degrees, shift)) + (
+        0.0 if math.isnan(wrong_sign) else wrong_sign
+    )
 
 
 def detectable(seeds: int, level: float) -> float:

@@ -168,6 +168,7 @@ def test_the_horizon_is_that_of_a_time_limit_if_nothing_else_says_it() -> None:
     assert SyncCMDPVectorEnv("countdown", [limited]).cmdp.horizon is None
     assert SyncCMDPVectorEnv("countdown", [partial(limited, 7)]).cmdp.horizon == 7
     assert SyncCMDPVectorEnv("countdown", [partial(limited, 5, 7)]).cmdp.horizon == 5
+    assert SyncCMDPVectorEnv("countdown", [partial(limited, 7, 5)]).cmdp.horizon == 5
 
 
 def test_a_wrapper_that_changes_observations_must_say_what_they_consist_of() -> None:
@@ -186,7 +187,7 @@ def test_a_wrapper_that_changes_observations_must_say_what_they_consist_of() -> 
             return np.tile(observation, 2)
 
     with pytest.raises(
-        ValueError, match=r"a wrapper changes the observation from 3 to 6 numbers.*or \(\) for none"
+        ValueError, match=r"describe 3 numbers, and its wrappers give 6; .* or \(\) for none$"
     ):
         SyncCMDPVectorEnv("declared", [lambda: Doubled(Declared())])
     plain = SyncCMDPVectorEnv("declared", [lambda: Doubled(Declared(), observation_components=())])

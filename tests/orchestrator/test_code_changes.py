@@ -26,6 +26,7 @@ from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.launch_plan import PlannedAction, TrialSelection, make_plan
 from recrl.orchestrator.provenance import code_changes, versions
 from recrl.orchestrator.provenance.code_changes import (
+    CHANGED,
     CodeComparison,
     InstalledCode,
     code_of,
@@ -333,19 +334,22 @@ def test_the_code_of_a_task_is_found_without_running_it(folder: Path) -> None:
     assert "my_scaled_task" not in sys.modules
 
 
-def test_a_process_goes_on_with_the_code_that_it_imported_and_says_so(folder: Path) -> None:
+def test_a_process_that_goes_on_with_the_code_of_before_says_so(folder: Path) -> None:
     (spec,) = read_grid(folder / "grid.yaml").trials()
     sys.modules.pop("my_scaled_task", None)
     before = code_of(spec)
     import_module("my_scaled_task")
+    assert code_of(spec) == before
     (folder / "my_scaled_task.py").write_text(TASK + "LATER = 1\n")
     with pytest.warns(UserWarning, match="has changed since this process imported it"):
         module = import_module("my_scaled_task")
-    assert code_of(spec) == before
-    assert compare([{"code": before}], spec).differs, "a later launch says that the code is another one"
+    assert code_of(spec) == {**before, "my_scaled_task": CHANGED}
+    assert compare([{"code": code_of(spec)}], spec).differs, (
+        "a later launch says that the code is another one"
+    )
     importlib.reload(module)
     import_module("my_scaled_task")
-    assert code_of(spec) != before
+    assert code_of(spec) == InstalledCode().of(spec) != before
 
 
 def test_modules_that_a_plug_in_imports_are_among_its_code(folder: Path) -> None:

@@ -77,6 +77,20 @@ def test_letters_outside_ascii_are_cut_at_the_right_byte() -> None:
     assert without_documentation('"""Größe."""; a = "ß"\n'.encode()) == '; a = "ß"'.encode()
 
 
+def test_a_file_in_another_encoding_is_cut_at_the_right_place() -> None:
+    source = '# coding: latin-1\ndef f():\n    "éééééééééééé"; return 1\n'.encode("latin-1")
+    assert without_documentation(source) == b"def f():\n    ; return 1"
+
+
+def test_a_docstring_that_the_code_reads_counts() -> None:
+    source = b'def f():\n    "3"\n    return int(f.__doc__)\n'
+    assert without_documentation(source) == source
+
+
+def test_warnings_of_the_source_change_nothing() -> None:
+    assert without_documentation(b"a = '\\d'\n# b\n") == b"a = '\\d'"
+
+
 @pytest.mark.parametrize("source", [b"def f(:\n    # x\n", b"\x00", b"\xff\xfe"])
 def test_what_does_not_parse_stays(source: bytes) -> None:
     assert without_documentation(source) == source

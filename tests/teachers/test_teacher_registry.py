@@ -138,9 +138,12 @@ def test_plain_and_numpy_numbers_become_what_json_can_hold() -> None:
     )
 
 
-def test_text_is_no_list_of_limits() -> None:
-    with pytest.raises(ValueError, match=r"^cost limits must be numbers, got '55'$"):
-        CostLimits("55")  # type: ignore[arg-type]
+@pytest.mark.parametrize("limits", ["55", 5.0, None])
+def test_what_is_no_list_of_limits_is_refused(limits: Any) -> None:
+    sentence = f"^cost limits must be a list of numbers, got {limits!r}$"
+    for make in (CostLimits, CurriculumStep, lambda given: TeacherSpec("linear", {}, given, given, 1)):
+        with pytest.raises(ValueError, match=sentence):
+            make(limits)
 
 
 @pytest.mark.parametrize("noise", [-0.1, 1.1])
