@@ -14,7 +14,8 @@ An environment may name its costs in an attribute ``cost_names``. Its horizon, f
 the smallest of ``spec.max_episode_steps``, a number in an attribute ``horizon``, and the steps of Gymnasium's
 ``TimeLimit``. It may describe the slices of its flattened observation in ``observation_components``, a
 sequence of ``recrl.environments.cmdp.ObservationComponent``; from it agents learn which of them are lidars.
-Observations of any kind are flattened to float32 vectors (``gymnasium.spaces.flatten``), actions clipped to their bounds.
+Observations of any kind are flattened to float32 vectors (``gymnasium.spaces.flatten``), actions clipped to
+their bounds.
 
 Every episode starts with ``reset(seed=...)`` and a new seed drawn here. A checkpoint holds that seed and the
 actions so far, so the environment need not be pickled. Restoring replays them, at most one episode per
