@@ -12,15 +12,14 @@ from typing import Any
 
 import pandas as pd
 
-from recrl.analysis.data.sweep_data import load
-from recrl.orchestrator.files.sweep_store import SweepStore
+import recrl
 
 KEYS = ["task", "agent", "method", "seed", "policy"]
 
 
 def final_policies(sweep: Path) -> pd.DataFrame:
     """Means over the episodes of each evaluation, with standard errors; complete trials only."""
-    evaluations = load(SweepStore(sweep.parent, sweep.name)).evaluations
+    evaluations = recrl.load_sweep(sweep).evaluations
     grouped = evaluations.groupby(KEYS, observed=True)
     columns = {"return": "episode_return", "cost": "cost_0"}
     table: dict[str, pd.Series[Any]] = {"episodes": grouped.size()}
@@ -34,7 +33,7 @@ def final_policies(sweep: Path) -> pd.DataFrame:
 def write_table(description: str | None, table_of: Callable[[Path], pd.DataFrame]) -> None:
     """Print and write the table of the sweep that the command line names."""
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("sweep", type=Path)
+    parser.add_argument("sweep", type=Path, help="its folder or an export")
     parser.add_argument("--to", type=Path, required=True)
     arguments = parser.parse_args()
     table = table_of(arguments.sweep)
