@@ -151,10 +151,10 @@ def decide(
     kept = _kept(new, limits, config)
     if config.dimensions == "joint":
         kept = [all(kept)] * len(limits)
-    is_stuck = any(has_converged and not keeps for has_converged, keeps in zip(converged, kept, strict=True))
+    is_stuck = any(is_converged and not keeps for is_converged, keeps in zip(converged, kept, strict=True))
     lowered = tuple(
-        next_limit(limit, cost, deploy, remaining=remaining) if has_converged and keeps else limit
-        for limit, cost, deploy, has_converged, keeps in zip(
+        next_limit(limit, cost, deploy, remaining=remaining) if is_converged and keeps else limit
+        for limit, cost, deploy, is_converged, keeps in zip(
             limits, new.mean_costs, deploy_limits, converged, kept, strict=True
         )
     )
