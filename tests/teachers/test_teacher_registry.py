@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.plugins import UnknownNameError
 from recrl.teachers.dynamic_options import PAPER, DynamicConfig
-from recrl.teachers.registry import TEACHERS, TeacherKind, make_teacher, teacher_config
+from recrl.teachers.registry import TEACHERS, TeacherKind, find_teacher, make_teacher, teacher_config
 from recrl.teachers.static import NoConfig, step_teacher
 from recrl.teachers.teacher import TeacherSpec
 
@@ -167,3 +167,12 @@ def test_a_step_survives_json_and_ends_with_deployment(step: CurriculumStep) -> 
     assert deployed.start_limits == step.start_limits
     assert (deployed.entropy_coefficient is None) == (step.entropy_coefficient is None)
     assert not deployed.rewards_entropy
+
+
+@pytest.mark.parametrize("name", sorted(TEACHERS))
+def test_an_option_that_is_not_stored_has_its_default(name: str) -> None:
+    """Else a stored trial without it would be read as another one, and get another identity."""
+    config = find_teacher(name).config
+    hidden = {key: field for key, field in config.model_fields.items() if field.exclude_if is not None}
+    for key, field in hidden.items():
+        assert field.exclude_if is not None and field.exclude_if(field.default), key
