@@ -174,9 +174,9 @@ def _require_newest(module: ModuleType) -> None:
 
 
 def _is_same_file(one: str, other: str) -> bool:
-    """Whether two paths lead to one file; True if that is unknown, as in an archive."""
+    """Whether two paths lead to one file or to a copy of it; True if that is unknown, as in an archive."""
     try:
-        return Path(one).samefile(other)
+        return Path(one).samefile(other) or Path(one).read_bytes() == Path(other).read_bytes()
     except OSError:
         return True
 

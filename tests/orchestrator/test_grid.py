@@ -1,7 +1,6 @@
 """A grid file is checked whole: every mistake at once, each with its line; what is right is a product."""
 
 import math
-import re
 from pathlib import Path
 
 import pytest
@@ -481,71 +480,15 @@ def test_the_grids_we_ship_are_right(path: Path) -> None:
     assert len(grid.trials()) == SHIPPED[path.stem]
 
 
-# Grids of results are archives. These name options and a curriculum that no longer exist: the refused fields.
-POSE = "tasks.*.options.observation"
-CALM = [POSE, "agents.0.options.noisy_target_kl"]
-BOTH = [*CALM, "agents.1.options.limit_margin"]
-LONG = [
-    *BOTH,
-    "agents.0.options.multiplier_geometric",
-    "agents.0.options.limit_margin",
-    "agents.1.options.temperature",
-]
-NOISY = [f"agents.{i}.options.noisy_target_kl" for i in range(3)]
-WAITS = [f"agents.{i}.options.multiplier_waits" for i in range(2)]
-REFUSED = {
-    "rivergrid/annealed": ["methods.0"],
-    "rivergrid/annealed-capped": [WAITS[0], "methods.0.name"],
-    "rivergrid/annealed-capped-generated": [WAITS[0], "methods.2.name"],
-    "rivergrid/annealed-generated": ["methods.0"],
-    "rivergrid/annealed-wide": [*WAITS, *NOISY, "methods.0", "methods.1.name"],
-    "rivergrid/annealed-wide-1": [WAITS[0], *NOISY[:2], "methods.0.name"],
-    "rivergrid/cooling": [POSE, *NOISY[:2]],
-    "rivergrid/cooling-1": CALM,
-    "rivergrid/cooling-both": [*BOTH, "agents.1.options.temperature"],
-    "rivergrid/cooling-both-1": BOTH,
-    "rivergrid/cooling-calm": CALM,
-    "rivergrid/cooling-calm-1": CALM,
-    "rivergrid/cooling-fresh": [POSE, *NOISY[:2]],
-    "rivergrid/cooling-long": LONG,
-    "rivergrid/cooling-long-1": LONG,
-    "rivergrid/cooling-new": LONG,
-    "rivergrid/cooling-new-1": LONG,
-    "rivergrid/cooling-still-1": [POSE, "agents.0.options.limit_margin", "agents.0.options.temperature"],
-    "rivergrid/cross-fitted": ["agents.0.options.cross_fitting"],
-    "rivergrid/pose": [POSE, WAITS[0], *NOISY[:2], "methods.0.name"],
-    "safety-gym/cross-fitted": ["agents.0.options.cross_fitting"],
-}
 RESULTS = {
     path.relative_to(ROOT / "results").with_suffix("").as_posix(): path
     for path in sorted((ROOT / "results").glob("*/*.yaml"))
 }
 
 
-def _refusal(field: str) -> str:
-    """How the sentence about a field of ``REFUSED`` begins."""
-    if field == POSE:
-        return f"{field}: must be 'factored' or 'joint', got 'pose'"
-    return f"{field}: " + ("no curriculum is called 'annealed' (" if "methods" in field else "unknown key")
-
-
 @pytest.mark.parametrize("name", RESULTS)
-def test_the_grids_of_our_results_are_right_but_for_what_was_removed_since(name: str) -> None:
-    if name not in REFUSED:
-        assert read_grid(RESULTS[name]).trials()
-        return
-    with pytest.raises(GridError) as caught:
-        read_grid(RESULTS[name])
-    place = re.compile(re.escape(str(RESULTS[name])) + r":\d+: ")
-    assert all(place.match(problem) for problem in caught.value.problems)
-    problems = [re.sub(r"^tasks\.\d+", "tasks.*", place.sub("", text)) for text in caught.value.problems]
-    expected = {_refusal(field) for field in REFUSED[name]}
-    assert {begin for begin in expected if any(text.startswith(begin) for text in problems)} == expected
-    assert all(text.startswith(tuple(expected)) for text in problems), problems
-
-
-def test_every_grid_of_our_results_that_is_refused_is_there() -> None:
-    assert set(REFUSED) <= set(RESULTS)
+def test_the_grids_of_our_results_are_right(name: str) -> None:
+    assert read_grid(RESULTS[name]).trials()
 
 
 @pytest.mark.parametrize("key", ["train_limits", "deploy_limits"])
