@@ -28,7 +28,7 @@ from __future__ import annotations
 import copy
 import functools
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import gymnasium
@@ -373,16 +373,20 @@ def _declared_horizon(environment: Environment) -> int | None:
     declared = environment.get_wrapper_attr("horizon") if environment.has_wrapper_attr("horizon") else None
     if isinstance(declared, float) and declared.is_integer():
         declared = int(declared)
-    is_number = isinstance(declared, int | np.integer) and not isinstance(declared, bool) and declared >= 1
-    known = [
-        environment.spec.max_episode_steps if environment.spec else None,
-        declared if is_number else None,
-    ]
-    inner = environment
-    while isinstance(inner, gymnasium.Wrapper):
-        known += [inner._max_episode_steps] if isinstance(inner, TimeLimit) else []  # there is no public name
-        inner = inner.env
-    return min((int(steps) for steps in known if steps is not None), default=None)
+    horizons = list(_time_limits(environment))
+    if environment.spec is not None and environment.spec.max_episode_steps is not None:
+        horizons.append(environment.spec.max_episode_steps)
+    if isinstance(declared, int | np.integer) and not isinstance(declared, bool) and declared >= 1:
+        horizons.append(int(declared))
+    return min(horizons, default=None)
+
+
+def _time_limits(environment: Environment) -> Iterator[int]:
+    """Yield the steps of each ``TimeLimit`` around an environment."""
+    while isinstance(environment, gymnasium.Wrapper):
+        if isinstance(environment, TimeLimit):
+            yield environment._max_episode_steps  # there is no public name
+        environment = environment.env
 
 
 def _declared_components(environment: Environment) -> tuple[ObservationComponent, ...]:
@@ -398,8 +402,8 @@ def _declared_components(environment: Environment) -> tuple[ObservationComponent
             )
     declared = sum(component.size for component in components)
     size = spaces.flatdim(environment.observation_space) if components else 0
-    is_inner = getattr(environment.unwrapped, "observation_components", None) is not None
-    if declared != size and is_inner and environment.unwrapped is not environment:
+    inner = environment.unwrapped
+    if declared != size and inner is not environment and hasattr(inner, "observation_components"):
         raise ValueError(
             f"the environment's observation_components describe {declared} numbers, and its wrappers give "
             f"{size}; let the wrapper that changes the observation have observation_components of its own, "

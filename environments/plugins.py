@@ -143,29 +143,35 @@ def import_module(name: str) -> ModuleType:
             sys.path.append(folder)
             _appended.add(folder)
     module = importlib.import_module(name)
-    _require_newest(module)
+    _require_same_place(name.partition(".")[0])
+    _warn_if_changed(module)
     return module
 
 
-def _require_newest(module: ModuleType) -> None:
-    """Raise ImportError if a module is found in another folder than before; warn if its file has changed."""
+def _require_same_place(package: str) -> None:
+    """Raise ImportError if an imported package or module would now be found elsewhere."""
+    spec: ModuleSpec | None = getattr(sys.modules.get(package), "__spec__", None)
+    if spec is None or spec.name != package:  # __main__
+        return
+    found = PathFinder.find_spec(package)
+    if found is not None and found.origin and spec.origin and not _is_same_file(found.origin, spec.origin):
+        raise ImportError(
+            f"this process imported {package} from {spec.origin}, and now {found.origin} is found; start a "
+            "new Python process"
+        )
+
+
+def _warn_if_changed(module: ModuleType) -> None:
+    """Warn if the file of a module has changed since this process imported it."""
     name, spec = module.__name__, module.__spec__
     if spec is None or spec.origin is None or not Path(spec.origin).is_file():
         return
-    top_name = name.partition(".")[0]
-    top: ModuleSpec | None = getattr(sys.modules.get(top_name), "__spec__", None)
-    if top is None or top.name != top_name:  # __main__
-        return
-    found = PathFinder.find_spec(top_name)
-    if found is not None and found.origin and top.origin and not _is_same_file(found.origin, top.origin):
-        raise ImportError(
-            f"this process imported {top_name} from {top.origin}, and now {found.origin} is found; start a "
-            "new Python process"
-        )
     now = Path(spec.origin).read_bytes()
-    if _imported.setdefault(name, (spec, now))[0] is not spec:  # it was reloaded
-        _imported[name] = (spec, now)
-    if _imported[name][1] != now:
+    imported, source = _imported.get(name, (spec, now))
+    if imported is not spec:  # it was reloaded
+        source = now
+    _imported[name] = (spec, source)
+    if source != now:
         warnings.warn(
             f"{spec.origin} has changed since this process imported it; the code of before runs until you "
             f"start a new Python process or call importlib.reload(sys.modules[{name!r}])",

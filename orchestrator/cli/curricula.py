@@ -127,7 +127,7 @@ def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
             raise RecrlError(f"--option: must look like window=8, got {pair!r}")
         changed[key] = _parsed(value)
     try:
-        options = {**(_chosen(method) if "preset" in changed else method.options), **changed}
+        options = {**(_beside_preset(method) if "preset" in changed else method.options), **changed}
         require_json(options)
         teacher_config(method.name, options)
     except ValidationError as error:
@@ -147,7 +147,7 @@ def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
     return Choice(method.name, options, method.label)
 
 
-def _chosen(method: Choice) -> dict[str, Any]:
+def _beside_preset(method: Choice) -> dict[str, Any]:
     """Return the options of a method that differ from the defaults of its preset."""
     preset = {"preset": method.options["preset"]} if "preset" in method.options else {}
     defaults = teacher_config(method.name, preset).model_dump()

@@ -1,7 +1,7 @@
 """Detect whether a trial ran other code, or with other versions of libraries, than is installed now.
 
 A trial's results depend on recrl's tasks, agents, curricula and training loop, not on figures or commands:
-only the former are in the digest. Docstrings and lines with a comment alone are not.
+only the former are in the digest. Docstrings and lines that only have a comment are not.
 A user's task, agent or curriculum has a digest of its top-level package (all Python files) or single module.
 Each module of the user's project that it imports, directly or through others, has one too. Nothing is
 imported to find them: import statements are read from the files. So modules in the working directory are
@@ -62,14 +62,17 @@ _ran: dict[tuple[str, Path | None], tuple[dict[str, ModuleSpec | None], dict[str
 class InstalledCode:
     """The code that is installed now; each package is read once, for many trials.
 
+    Args:
+        digests_of: returns the digest of a top-level package or module, and of those of its project that it
+            imports; None for those of the files as they are.
+
     Attributes:
         libraries: versions of ``LIBRARIES``.
-        digests_of: of a top-level package or module, and of those of its project that it imports.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, digests_of: Callable[[str], dict[str, str]] | None = None) -> None:
         self._module_of = functools.cache(_module_of)
-        self.digests_of: Callable[[str], dict[str, str]] = functools.cache(_digests_of)
+        self._digests_of = functools.cache(digests_of or _digests_of)
         self.libraries = _without_builds(package_versions(LIBRARIES))
 
     def of(self, spec: TrialSpec) -> dict[str, str]:
@@ -87,7 +90,7 @@ class InstalledCode:
             if isinstance(network := choice.options.get("network"), str):
                 names.append(network)
             for name in filter(None, names):
-                found |= self.digests_of(name.partition(":")[0].partition(".")[0])
+                found |= self._digests_of(name.partition(":")[0].partition(".")[0])
         return found
 
 
@@ -97,9 +100,7 @@ def code_of(spec: TrialSpec) -> dict[str, str]:
     A process imports a package once. If its files have changed since, ``CHANGED`` is in place of a digest, so
     that the trial counts as one of other code.
     """
-    installed = InstalledCode()
-    installed.digests_of = _digests_of_imported
-    return installed.of(spec)
+    return InstalledCode(_digests_of_imported).of(spec)
 
 
 @dataclass(frozen=True)
@@ -252,18 +253,22 @@ def _digests_of_imported(package: str) -> dict[str, str]:
     that it had imported were reloaded.
     """
     digests, place = _digests_of(package), (package, _folder(_files_of(package)))
-    tops = digests.keys() | {package}
-    loaded = {
-        name: module.__spec__
-        for name, module in list(sys.modules.items())
-        if name.partition(".")[0] in tops and hasattr(module, "__spec__")
-    }
-    before, first = _ran.get(place, (loaded, digests))
-    are_reloaded = bool(before) and all(loaded.get(name) is not spec for name, spec in before.items())
+    imported = _imported_of(digests.keys() | {package})
+    before, first = _ran.get(place, (imported, digests))
+    are_reloaded = bool(before) and all(imported.get(name) is not spec for name, spec in before.items())
     if digests == first or are_reloaded:
-        _ran[place] = (loaded, digests)
+        _ran[place] = (imported, digests)
         return digests
     return {name: digest if digest == first.get(name) else CHANGED for name, digest in digests.items()}
+
+
+def _imported_of(packages: Collection[str]) -> dict[str, ModuleSpec | None]:
+    """Return the modules of some packages that this process has imported, with how it found each."""
+    return {
+        name: getattr(module, "__spec__", None)
+        for name, module in list(sys.modules.items())
+        if name.partition(".")[0] in packages
+    }
 
 
 def _digests_of(package: str) -> dict[str, str]:

@@ -28,27 +28,28 @@ def source_digest() -> str:
 
 def digest_of_files(files: Mapping[str, Path]) -> str:
     """Return 64 hex digits that change with the name of a file and with any of its bytes."""
-    return _digest(files, lambda content: content)
+    return _digest(files, Path.read_bytes)
 
 
 def digest_of_code(files: Mapping[str, Path]) -> str:
-    """Return 64 hex digits that change with the code in files.
+    """Return 64 hex digits that change with the name of a file and with the code in it.
 
-    Docstrings and lines with a comment alone do not count. Of files that are not Python every byte counts.
+    Docstrings and lines that only have a comment are not code. Other files than Python's count as a whole.
     """
-    python = {name: path for name, path in files.items() if path.suffix == ".py"}
-    others = {name: path for name, path in files.items() if name not in python}
-    return hashlib.sha256(
-        f"{_digest(python, without_documentation)} {digest_of_files(others)}".encode()
-    ).hexdigest()
+    return _digest(files, _code)
 
 
-def _digest(files: Mapping[str, Path], part: Callable[[bytes], bytes]) -> str:
-    """Return the digest of the names of files and of a part of their contents."""
+def _code(path: Path) -> bytes:
+    content = path.read_bytes()
+    return without_documentation(content) if path.suffix == ".py" else content
+
+
+def _digest(files: Mapping[str, Path], read: Callable[[Path], bytes]) -> str:
+    """Return the digest of the names of files and of what ``read`` gives of each."""
     digest = hashlib.sha256()
     for name, path in sorted(files.items()):
         with suppress(OSError):  # an editor's file that came and went
-            digest.update(hashlib.sha256(part(path.read_bytes())).digest() + f"{name}\n".encode())
+            digest.update(hashlib.sha256(read(path)).digest() + f"{name}\n".encode())
     return digest.hexdigest()
 
 

@@ -34,37 +34,32 @@ MAP = """
 '''
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("What the module is for.", "A module."),
-        ("Over several lines.\n", ""),
-        ('    """A box."""\n\n', ""),
-        ("# the area.", "the area, in square metres"),
-        ("        # squared\n", ""),
-        ("import os\n\n\n", "# for files\nimport os\n"),
-    ],
-)
-def test_documentation_does_not_count(old: str, new: str) -> None:
-    changed = SOURCE.replace(old, new)
-    assert changed != SOURCE
-    assert without_documentation(changed.encode()) == without_documentation(SOURCE.encode())
+DOCUMENTATION = [
+    ("What the module is for.", "A module."),
+    ("Over several lines.\n", ""),
+    ('    """A box."""\n\n', ""),
+    ("# the area.", "the area, in square metres"),
+    ("        # squared\n", ""),
+    ("import os\n\n\n", "# for files\nimport os\n"),
+]
+CODE = [
+    ("size = 3", "size = 4"),
+    ("# a wall", "# a door"),  # within a string
+    ("wall\n\n", "wall\n"),
+    ('MAP = """', 'PLAN = """'),
+    ("        return", "    return"),
+]
 
 
 @pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("size = 3", "size = 4"),
-        ("# a wall", "# a door"),  # within a string
-        ("wall\n\n", "wall\n"),
-        ('MAP = """', 'PLAN = """'),
-        ("        return", "    return"),
-    ],
+    ("old", "new", "counts"),
+    [(*change, False) for change in DOCUMENTATION] + [(*change, True) for change in CODE],
 )
-def test_code_and_strings_count(old: str, new: str) -> None:
+def test_code_and_strings_count_and_documentation_does_not(old: str, new: str, *, counts: bool) -> None:
     changed = SOURCE.replace(old, new)
     assert changed != SOURCE
-    assert without_documentation(changed.encode()) != without_documentation(SOURCE.encode())
+    differs = without_documentation(changed.encode()) != without_documentation(SOURCE.encode())
+    assert differs == counts
 
 
 def test_code_on_the_line_of_a_docstring_counts() -> None:
