@@ -3,15 +3,17 @@
     OMP_NUM_THREADS=1 python tests/benchmarks/known_optima.py [agent ...] --seeds 50 51 --to rows.csv
     python tests/benchmarks/known_optima.py --table rows.csv
 
-Every option has its default. A row of the CSV is one training and one of three policies, by exact expected
-values of an episode. ``final`` is the policy that a sweep evaluates and exports, ``last`` the one after the
-last update. ``mixture`` draws one of the policies of the last quarter of the updates for each episode. The
-regret is J*(d) - J, the excess the largest cost above its limit (negative if all are below).
+Every option has its default, but for those of ``--options``. A row of the CSV is one training and one of
+three policies, by exact expected values of an episode. ``final`` is the policy that a sweep evaluates and
+exports, ``last`` the one after the last update. ``mixture`` draws one of the policies of the last quarter of
+the updates for each episode. The regret is J*(d) - J, the excess the largest cost above its limit (negative
+if all are below).
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -82,8 +84,8 @@ TASKS = {
 }
 
 
-def train(name: str, agent_name: str, seed: int) -> Iterator[dict[str, Any]]:
-    """Train an agent; yield a row for each policy."""
+def train(name: str, agent_name: str, seed: int, options: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Train an agent with some options; yield a row for each policy."""
     task = TASKS[name]
     limits = CostLimits(task.limits)
     optimum = optimal_return(task.name, task.options, limits)
@@ -91,7 +93,7 @@ def train(name: str, agent_name: str, seed: int) -> Iterator[dict[str, Any]]:
     environment_seed, agent_seed, policy_seed = np.random.SeedSequence(seed).spawn(3)
     environments = make_vector(task.name, task.num_envs, options=task.options)
     assert isinstance(environments, FiniteVectorEnv)
-    agent = make_agent(agent_name, environments.cmdp, {}, agent_seed)
+    agent = make_agent(agent_name, environments.cmdp, options, agent_seed)
     collector = Collector(environments, num_steps=task.num_steps)
     collector.reset(seed=int(environment_seed.generate_state(1)[0]))
     generator = np.random.default_rng(policy_seed)
@@ -144,6 +146,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("agents", nargs="*", metavar="AGENT", help="default: all")
     parser.add_argument("--only", nargs="+", default=list(TASKS), choices=TASKS, metavar="TASK")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument(
+        "--options", type=json.loads, default={}, metavar="JSON", help="options of the agents"
+    )
     parser.add_argument("--to", type=Path, help="the CSV file that the rows are written to")
     parser.add_argument(
         "--table", nargs="+", type=Path, help="print the table of these CSV files; do not train"
@@ -158,7 +163,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for task in parsed.only:
         for agent in parsed.agents or AGENTS:
             for seed in parsed.seeds:
-                written += train(task, agent, seed)
+                written += train(task, agent, seed, parsed.options)
                 for row in written[-len(POLICIES) :]:
                     print(
                         "{task} {agent} {seed} {policy}: {regret:.3f} {excess:.3f}".format(**row), flush=True
