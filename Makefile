@@ -30,7 +30,7 @@ demo: install
 	$(BIN)/recrl-sweep launch grids/demo.yaml
 
 test: install
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart=0
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart=0 --durations=20
 
 lint: install
 	$(BIN)/ruff check .
