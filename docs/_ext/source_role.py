@@ -1,7 +1,7 @@
 """The role ``src``: a file of the repository, or a name in it, which must exist.
 
-    {src}`teachers/dynamic.py`                  the file
-    {src}`teachers/dynamic.py:has_converged`    a function, class, method or constant that it defines
+    {src}`teachers/dynamic_rules.py`                  the file
+    {src}`teachers/dynamic_rules.py:has_converged`    a function, class, method or constant that it defines
 
 A missing file or name is a warning, and so an error of the build.
 """

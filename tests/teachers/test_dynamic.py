@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
-from recrl.teachers.dynamic import (
-    DynamicTeacher,
+from recrl.teachers.dynamic import DynamicTeacher
+from recrl.teachers.dynamic_options import DynamicConfig
+from recrl.teachers.dynamic_rules import (
     decide,
     has_converged,
     is_precise,
@@ -19,7 +20,6 @@ from recrl.teachers.dynamic import (
     next_limit,
     steps_left,
 )
-from recrl.teachers.dynamic_options import DynamicConfig
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 from recrl.teachers.windows import WindowStatistics
