@@ -106,7 +106,8 @@ def source(request: SourceRequest) -> tuple[Sweep, Path]:
 
 def draw(sweep: Sweep, folder: Path, console: Console, *, band: str = "mean", whole: bool = True) -> None:
     """Draw a sweep's figures, tables and report, and print their place."""
-    from recrl.analysis.report.drawing import curve_averages, draw, sketch  # noqa: PLC0415  (imports matplotlib)
+    from recrl.analysis.report.drawing import draw, sketch  # noqa: PLC0415  (imports matplotlib)
+    from recrl.analysis.report.figure_list import curve_averages  # noqa: PLC0415
 
     (draw if whole else sketch)(sweep, folder, averaging=curve_averages()[band])
     say(console, f"Figures    {short(folder)}")

@@ -10,7 +10,7 @@ import pytest
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures.cumulative_cost import cumulative_bounds
-from recrl.analysis.report.drawing import drawings
+from recrl.analysis.report.figure_list import drawings
 from recrl.analysis.report.text_tables import admissible_table, bound_table
 from recrl.analysis.statistics import cumulative_cost
 from recrl.analysis.statistics.metrics import training_totals

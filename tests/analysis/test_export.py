@@ -18,7 +18,7 @@ from recrl.analysis.data import export, sweep_data
 from recrl.analysis.data.sweep_data import Sweep, drawn_columns
 from recrl.analysis.figures import styles
 from recrl.analysis.figures.diagnostics import curriculum_diagnostics
-from recrl.analysis.report import drawing, table_files
+from recrl.analysis.report import figure_list, table_files
 from recrl.analysis.statistics import metrics
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import DamagedError, RecrlError
@@ -70,7 +70,7 @@ def test_figures_and_tables_are_drawn_from_it(
     sweep = sweep_data.load(store)
     small = export.load(export.save(sweep, tmp_path / "sweep.zip"))
     for stem in ("learning-curves_cpo", "curricula"):
-        pictures = [drawing.drawings(it)[stem].make() for it in (sweep, small)]
+        pictures = [figure_list.drawings(it)[stem].make() for it in (sweep, small)]
         one, other = (
             pixels(styles.save_png(picture, tmp_path / f"{number}.png"))
             for number, picture in enumerate(pictures)

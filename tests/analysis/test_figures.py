@@ -21,7 +21,7 @@ from recrl.analysis.figures import learning_curves, styles
 from recrl.analysis.figures.diagnostics import curriculum_diagnostics
 from recrl.analysis.figures.frontier import concave_frontier, return_against_cost
 from recrl.analysis.figures.styles import IN_FORCE_COLOUR, LIMIT_COLOUR, OPTIMUM_COLOUR, STYLES
-from recrl.analysis.report.drawing import drawings
+from recrl.analysis.report.figure_list import drawings
 from recrl.orchestrator.files.sweep_store import SweepStore
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.report import drawing, table_files, verdict_texts
-from recrl.analysis.report.drawing import NothingToDrawError
+from recrl.analysis.report import drawing, figure_list, table_files, verdict_texts
+from recrl.analysis.report.figure_list import NothingToDrawError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from tests.faults.committing import commit_file
 
@@ -84,7 +84,7 @@ def test_before_any_trial_is_complete_there_are_curves_and_no_table(
     assert "outcomes.csv" not in names
     assert "No trial is complete yet: no verdict." in (tmp_path / "report.md").read_text()
     for stem in ("bounds_cpo", "return-against-cost", "performance-profiles"):
-        assert drawing.drawings(sweep)[stem].make() is None
+        assert figure_list.drawings(sweep)[stem].make() is None
 
 
 def test_a_sketch_has_what_changes_while_a_sweep_runs_and_all_tables(
@@ -111,7 +111,7 @@ def test_labels_that_differ_only_in_other_signs_have_figures_of_their_own(
     store = made_up_sweep(
         seeds=1, tasks=["a_1", "a 1"], agents=["β=0.1", "λ=0.1"], methods=["none"], updates=10
     )
-    figures = drawing.drawings(sweep_data.load(store))
+    figures = figure_list.drawings(sweep_data.load(store))
     captions = {stem: it.caption.split(":")[0] for stem, it in figures.items() if it.kind == "diagnostics"}
     assert captions == {
         "diagnostics_a-1_-0.1": "a 1, β=0.1",

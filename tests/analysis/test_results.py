@@ -11,7 +11,7 @@ from PIL import Image
 from recrl.analysis.data import export
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import styles
-from recrl.analysis.report import drawing, table_files
+from recrl.analysis.report import figure_list, table_files
 from recrl.analysis.statistics.cumulative_cost import cumulative_costs
 
 RESULTS = Path(__file__).parents[2] / "results" / "rivergrid"
@@ -31,7 +31,7 @@ def rivergrid() -> Sweep:
     "stem", ["learning-curves_cpo", "curricula", "policies_ppo-lag", "return-against-cost"]
 )
 def test_figures_are_redrawn_pixel_by_pixel(rivergrid: Sweep, tmp_path: Path, stem: str) -> None:
-    figure = drawing.drawings(rivergrid)[stem].make()
+    figure = figure_list.drawings(rivergrid)[stem].make()
     assert figure is not None
     redrawn = styles.save_png(figure, tmp_path / "figure.png")
     with Image.open(redrawn) as one, Image.open(RESULTS / "figures" / f"{stem}.png") as other:
@@ -40,7 +40,7 @@ def test_figures_are_redrawn_pixel_by_pixel(rivergrid: Sweep, tmp_path: Path, st
 
 def test_every_committed_figure_has_its_drawing(rivergrid: Sweep) -> None:
     committed = {path.stem for path in (RESULTS / "figures").glob("*.png")}
-    assert committed == set(drawing.drawings(rivergrid))
+    assert committed == set(figure_list.drawings(rivergrid))
 
 
 def test_tables_are_rewritten_byte_by_byte(rivergrid: Sweep, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import doubts, mixed_code_sentence, mixed_versions_sentence
-from recrl.analysis.report import drawing
+from recrl.analysis.report import pages
 
 REMEDY = "in a sweep's own folder, launch --rerun-changed makes it that of the installed version"
 
@@ -36,7 +36,7 @@ def test_seeds_of_a_cell_that_ran_different_code_are_one_sentence(finished: Swee
     )
     assert mixed_code_sentence(sweep) == sentence
     assert doubts(sweep)[1:] == [sentence]  # after that on code which is not installed
-    assert sentence in drawing.missing(sweep)
+    assert sentence in pages.missing(sweep)
 
 
 def test_an_export_is_advised_what_only_its_folder_can_do(finished: Sweep) -> None:
@@ -84,7 +84,7 @@ def test_versions_of_libraries_that_differ_between_seeds_are_one_sentence(finish
         "versions of libraries differ between seeds that are averaged (river-a cpo linear), so a difference "
         "may come from them: torch 2.12.0, 2.13.0"
     )
-    assert mixed_versions_sentence(sweep) in drawing.missing(sweep)
+    assert mixed_versions_sentence(sweep) in pages.missing(sweep)
 
 
 def test_a_curriculum_that_ran_with_other_versions_than_none_is_named(finished: Sweep) -> None:

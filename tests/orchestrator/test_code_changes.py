@@ -13,7 +13,7 @@ import pytest
 
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.sweep_warnings import curriculum_flags
-from recrl.analysis.report import drawing
+from recrl.analysis.report import pages
 from recrl.environments.plugins import import_module
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import ClusterError
@@ -116,7 +116,7 @@ def test_a_changed_task_is_said_everywhere_and_run_again_when_asked(
     assert SENTENCE in capsys.readouterr().out.splitlines()
     assert main(["evaluate", "small", "--policy", "stochastic", "--trust"]) == ExitCode.OK
     assert f"{SENTENCE}; these evaluations use the installed code" in capsys.readouterr().out.splitlines()
-    assert SENTENCE.removeprefix("warning: ") in drawing.missing(sweep_data.load(store))
+    assert SENTENCE.removeprefix("warning: ") in pages.missing(sweep_data.load(store))
 
     assert main(["launch", "grid.yaml", *INLINE, "--rerun-changed"]) == ExitCode.OK
     assert "small: 2 trials: 1 to run again on the present code, 1 complete\n" in capsys.readouterr().out
@@ -406,7 +406,7 @@ def test_of_a_package_that_is_not_here_it_is_said_that_it_was_not_compared(
     for command in (["status", "--brief"], ["figures"]):
         assert main(command) == ExitCode.OK
         assert f"warning: {sentence}" in capsys.readouterr().out.splitlines()
-    assert sentence in drawing.missing(sweep_data.load(store))
+    assert sentence in pages.missing(sweep_data.load(store))
 
 
 def test_a_changed_module_of_the_working_directory_is_found_without_trust(
@@ -498,7 +498,7 @@ def test_a_curriculum_that_is_none_is_an_event_and_a_warning(
         "seed 0, two-state ppo-lag dynamic seed 0; give a finite train_limits above d_d"
     )
     assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"
-    assert sentence in drawing.missing(sweep_data.load(store))
+    assert sentence in pages.missing(sweep_data.load(store))
     assert json.loads(store.trials()[0].provenance_path.read_text())["attempts"][0]["attempt"] == 1
 
 
@@ -521,7 +521,7 @@ def test_a_hard_landing_is_a_warning_unless_the_curriculum_is_a_control(
     assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"
     assert f"warning: {sentence}" in launched
     sweep = sweep_data.load(SweepStore(folder / "runs", "small"))
-    assert sentence in drawing.missing(sweep)
+    assert sentence in pages.missing(sweep)
     flags = curriculum_flags(sweep)
     assert flags["hard_landing"].tolist() == [method == "dynamic" for method in flags["method"]]
     assert not flags["no_curriculum"].any()

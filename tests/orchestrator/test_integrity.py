@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from recrl.analysis.data import sweep_data
-from recrl.analysis.report import drawing
+from recrl.analysis.report import pages
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import CheckpointError, DamagedError, RowError
 from recrl.orchestrator.executors import Executor, InlineExecutor
@@ -135,7 +135,7 @@ def test_a_complete_trial_that_was_cut_is_damaged_and_its_numbers_are_not_used(
     assert sweep.trials["status"].tolist() == ["complete", "damaged"]
     assert set(sweep.phases["method"]) == set(sweep.updates["method"]) == {"none"}
     title = trial.spec.title
-    assert f"{title}: damaged, 0% of its steps done: {sentence}" in drawing.missing(sweep)
+    assert f"{title}: damaged, 0% of its steps done: {sentence}" in pages.missing(sweep)
     for command in (["status", "--brief"], ["plan", "grid.yaml"], ["export", "small"]):
         assert main(command) == ExitCode.OK
         assert f"damaged: {title}: {sentence}\n" in capsys.readouterr().out
