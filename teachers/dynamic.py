@@ -13,7 +13,7 @@ literal pseudocode wherever it is defined.
   passed it in at most 59% of the cases. So a window includes more updates until the standard errors of its
   means are within the tolerances. Until then there is no decision. The tolerances are relative to the mean or
   to the episodes' standard deviation, whichever is larger, so that 100 episodes are always enough. A window
-  has at least ``LEAST_EPISODES``: two or three episodes agree by chance, and one has no standard error.
+  has at least ten episodes (``LEAST_EPISODES``): two or three agree by chance, and one has no standard error.
 - *A constant policy need not pass at once.* If both means have the standard error s, their difference has
   sqrt(2) s. So a quantity of a constant policy passes with probability erf(tolerance / (2 s)). That is 52% at
   s = tolerance, the least precision of a decision, and 84% at half of it. Return and cost must both pass,
@@ -71,7 +71,7 @@ from typing import Any
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats
 from recrl.teachers.dynamic_options import DynamicConfig
-from recrl.teachers.dynamic_rules import converged, decide, is_precise, steps_left
+from recrl.teachers.dynamic_rules import decide, is_precise, steps_left, which_converged
 from recrl.teachers.start_limits import StartMeasurement
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState, already_seen, progress
 from recrl.teachers.windows import WindowStatistics, extend, last_two_windows
@@ -214,7 +214,7 @@ class DynamicTeacher:
         has_changed = is_noisy or any(step.limits[index] != before[index] for index in costs)
         if is_due and self.config.clock_reset == "convergence":
             windows = self._windows(group)
-            has_changed = has_changed or (windows is not None and any(converged(*windows, self.config)))
+            has_changed = has_changed or (windows is not None and any(which_converged(*windows, self.config)))
         if not has_changed:
             return group
         history = () if is_noisy and self.config.windows_after_noise == 2 else group.history

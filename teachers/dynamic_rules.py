@@ -1,4 +1,4 @@
-"""The decisions of the dynamic curriculum: lines 5 to 10 of Algorithm 2, as functions of two windows.
+"""The decisions of the dynamic curriculum: lines 5 to 10 of Algorithm 2, as functions of windows.
 
 ``recrl.teachers.dynamic`` has the curriculum, and what these functions do where Algorithm 2 has gaps.
 
@@ -88,7 +88,7 @@ def decide(
     """
     if old.episodes == 0 or new.episodes == 0:
         return CurriculumStep(limits)
-    settled = converged(old, new, config)
+    settled = which_converged(old, new, config)
     kept = _kept(new, limits, config)
     if config.dimensions == "joint":
         kept = [all(kept)] * len(limits)
@@ -102,7 +102,7 @@ def decide(
     return CurriculumStep(CostLimits(lowered), config.policy_noise if is_stuck else 0.0)
 
 
-def converged(old: WindowStatistics, new: WindowStatistics, config: DynamicConfig) -> list[bool]:
+def which_converged(old: WindowStatistics, new: WindowStatistics, config: DynamicConfig) -> list[bool]:
     """Whether the return and the cost of each dimension have converged (line 5), [k].
 
     It is false if a window has no episode. With joint limits, it is the same for all costs.

@@ -23,7 +23,7 @@ For a running sweep, ``sketch`` draws only SKETCHED, as PNGs, and all tables and
 fraction of the time, and leaves the cores to the trials.
 
 Equal sweeps give equal bytes: the only time is that of the last policy update, and the bootstrap's generator
-is seeded here.
+is seeded with ``BOOTSTRAP_SEED``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The figures of a sweep: which there are, their file names and captions."""
+"""The figures of a sweep: which there are, their file names and captions, and the kinds of their curves."""
 
 from __future__ import annotations
 

@@ -117,6 +117,7 @@ def train(name: str, agent_name: str, seed: int, options: Mapping[str, Any]) -> 
     ):
         yield {
             "agent": agent_name,
+            "options": json.dumps(dict(options)),
             "task": name,
             "seed": seed,
             "policy": policy,
@@ -129,15 +130,15 @@ def train(name: str, agent_name: str, seed: int, options: Mapping[str, Any]) -> 
 
 
 def table(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return regret and excess by task, agent and policy: "mean (worst)" over the seeds."""
-    groups = rows.groupby(["task", "agent", "policy"], sort=False)[["regret", "excess"]]
+    """Return regret and excess by task, agent, options and policy: "mean (worst)" over the seeds."""
+    groups = rows.groupby(["task", "agent", "options", "policy"], sort=False)[["regret", "excess"]]
     means, worst = groups.mean(), groups.max()
     cells = {
         name: [f"{a:.3f} ({b:.3f})" for a, b in zip(means[name], worst[name], strict=True)]
         for name in means.columns
     }
     flat = pd.DataFrame(cells, means.index).reset_index()
-    return flat.pivot(index=["task", "agent"], columns="policy", values=["regret", "excess"])
+    return flat.pivot(index=["task", "agent", "options"], columns="policy", values=["regret", "excess"])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
