@@ -34,10 +34,10 @@ literal pseudocode wherever it is defined.
   before it, so an agent that follows each change immediately need not wait twice.
 - *Episodes that began before a change.* Policy updates may be short and episodes long. With 64 steps an
   update, an episode of 1,000 steps spans 16 updates, and the first window after a change has only episodes
-  that began before it: they may look converged and above the new limit. With ``overlapping_episodes: ignore``
-  no episode counts that ends within the duration of the longest one after a change. If all that began after
-  the change did count, the first ones to end would be the short ones, which are often the cheap ones. The
-  next decision comes later by that duration, so the remaining budget has fewer steps of line 7.
+  that began before it: they may look converged and above the new limit. So no episode counts that ends within
+  the duration of the longest one after a change. If all that began after the change did count, the first ones
+  to end would be the short ones, which are often the cheap ones. The next decision comes later by that
+  duration, so the remaining budget has fewer steps of line 7 (``overlapping_episodes``).
 - *last_change* is reset when limits or policy have changed. Line 11 also resets it when neither has, that is,
   whenever the agent has converged. With a limit of d_d or noise of 0 that delays the next test by a window
   (``clock_reset``).

@@ -23,6 +23,7 @@ PAPER = {
     "remaining": "episodes",
     "clock_reset": "convergence",
     "dimensions": "joint",
+    "overlapping_episodes": "count",
 }
 
 
@@ -108,10 +109,9 @@ class DynamicConfig(Options):
         "converged and are kept (literal).",
     )
     overlapping_episodes: Literal["count", "ignore"] = Field(
-        default="count",
+        default="ignore",
         description="Whether episodes count that may have begun before the last change of limits or policy. "
-        "If they are ignored, windows begin later by the longest episode, and line 7 has fewer steps.",
-        exclude_if=lambda value: value == "count",  # trials from before this option keep their identity
+        "If they are ignored (ours), windows begin later by the longest episode, and line 7 has fewer steps.",
     )
     policy_noise: float = Field(
         default=0.3,

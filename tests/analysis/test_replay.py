@@ -54,7 +54,7 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> TrialStore:
     "method",
     [
         SPEC.method,
-        Choice("dynamic", {"window": 2, "start_fraction": 0.1, "overlapping_episodes": "ignore"}),
+        Choice("dynamic", {"window": 2, "start_fraction": 0.1}),
         Choice("linear"),
         Choice("exponential"),
         Choice("step"),

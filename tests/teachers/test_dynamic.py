@@ -560,7 +560,9 @@ def test_a_noisy_agent_is_held_where_it_is_until_a_hundred_episodes_say_that_it_
         limits = step.limits
         costs = generator.exponential(80.0, 4)
         episodes = tuple(
-            EpisodeStats(b, Phase.TRAINING, 0, 1000, float(cost) / 10.0, (float(cost),), limits, 0.0)
+            EpisodeStats(
+                b, Phase.TRAINING, 4096 * update, 1000, float(cost) / 10.0, (float(cost),), limits, 0.0
+            )
             for b, cost in enumerate(costs)
         )
         total += len(episodes)
@@ -731,26 +733,25 @@ def teacher_of(budget: int = 950_000, **options: Any) -> DynamicTeacher:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_an_obedient_agent_gets_little_noise_if_earlier_episodes_do_not_count(seed: int) -> None:
-    changes, noises, limits = long_episodes(
-        teacher_of(overlapping_episodes="ignore"), horizon=1000, seed=seed
-    )
+    changes, noises, limits = long_episodes(teacher_of(), horizon=1000, seed=seed)
     assert noises <= 3  # by chance: a mean a little above its limit
     assert 5 <= changes <= 12
     assert limits[-1] == 25.0
     reached = limits.index(25.0) / len(limits)
     assert 0.6 <= reached <= 0.95
-    _, disturbed, _ = long_episodes(teacher_of(), horizon=1000, seed=seed)
+    counted = teacher_of(overlapping_episodes="count")
+    _, disturbed, _ = long_episodes(counted, horizon=1000, seed=seed)
     assert disturbed >= 4
 
 
 def test_short_episodes_hardly_overlap_a_change() -> None:
-    counted, _, _ = long_episodes(teacher_of(), horizon=64, seed=0)
-    ignored, _, _ = long_episodes(teacher_of(overlapping_episodes="ignore"), horizon=64, seed=0)
+    ignored, _, _ = long_episodes(teacher_of(), horizon=64, seed=0)
+    counted, _, _ = long_episodes(teacher_of(overlapping_episodes="count"), horizon=64, seed=0)
     assert ignored == pytest.approx(counted, rel=0.1)
 
 
 def test_no_episode_counts_that_ends_within_the_longest_one_after_a_change() -> None:
-    teacher = teacher_of(100_000, overlapping_episodes="ignore", window=1, window_grows=False)
+    teacher = teacher_of(100_000, window=1, window_grows=False)
 
     def reported(state: TeacherState, update: int, length: int, cost: float) -> Any:
         end = 1000 * update
@@ -777,7 +778,7 @@ def test_no_episode_counts_that_ends_within_the_longest_one_after_a_change() -> 
 @pytest.mark.parametrize("seed", range(3))
 def test_short_and_cheap_episodes_do_not_take_the_limit_to_d_d_at_once(seed: int) -> None:
     """Half of the episodes have 20 steps and cost nothing; the mean cost obeys the limit."""
-    teacher = teacher_of(2_000_000, overlapping_episodes="ignore")
+    teacher = teacher_of(2_000_000)
     _, _, limits = long_episodes(teacher, horizon=1000, seed=seed, short=0.5)
     before = [limit for limit in limits if limit < 250.0]
     assert before[0] > 150.0
