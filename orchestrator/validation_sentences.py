@@ -1,7 +1,7 @@
 """Pydantic's errors as sentences, each with its place in a file.
 
 A sentence has the allowed and the given value: ``must be at least 1, got 0``. An unknown key names the
-nearest known one.
+nearest known one, or says where it belongs.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from recrl.environments.plugins import nearest, nearest_name
+from recrl.environments.plugins import nearest_name
 from recrl.orchestrator.located_yaml import Place
 
 _SENTENCES: Mapping[str, str] = {
@@ -49,6 +49,27 @@ _SENTENCES: Mapping[str, str] = {
 }
 
 
+_MEANT: Mapping[str, str] = {  # names that others have for a key
+    "curricula": "methods",
+    "algorithms": "agents",
+    "environments": "tasks",
+    "cost_limit": "deploy_limits",
+    "cost_limits": "deploy_limits",
+    "total_timesteps": "total_steps",
+    "n_envs": "num_envs",
+    "gamma": "discount",
+    "gae_lambda": "reward_trace_decay",
+    "hidden_size": "hidden_sizes",
+}
+_SECTIONS: Mapping[str, str] = {  # keys that are often put beside options
+    "num_envs": "run",
+    "rollout_steps": "run",
+    "total_steps": "run",
+    "deploy_fraction": "run",
+    "evaluation_episodes": "run",
+}
+
+
 def sentences(error: ValidationError, model: type[BaseModel] | None) -> Iterator[tuple[Place, str]]:
     """Return all mistakes as (place relative to the validated value, sentence).
 
@@ -60,7 +81,7 @@ def sentences(error: ValidationError, model: type[BaseModel] | None) -> Iterator
     """
     items = error.errors(include_url=False)
     unknown = [item["loc"] for item in items if item["type"] == "extra_forbidden"]
-    meant = {(*it[:-1], nearest_name(str(it[-1]), known_keys(model, it[:-1]))) for it in unknown}
+    meant = {(*it[:-1], _intended(str(it[-1]), known_keys(model, it[:-1]))) for it in unknown}
     for item in items:
         place, kind = item["loc"], item["type"]
         if kind == "missing" and place in meant:
@@ -88,7 +109,7 @@ def known_keys(model: type[BaseModel] | None, place: Place) -> list[str]:
 def misspells(key: str, wanted: str, model: type[BaseModel]) -> bool:
     """Return whether a key is unknown to ``model``, and ``wanted`` is the nearest of its keys."""
     known = list(model.model_fields)
-    return key not in known and nearest_name(key, known) == wanted
+    return key not in known and _intended(key, known) == wanted
 
 
 def as_written(value: Any) -> str:
@@ -102,9 +123,19 @@ def as_written(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
+def _intended(key: str, known: list[str]) -> str | None:
+    """Return the known key that an unknown one stands for; None if there is none."""
+    meant = _MEANT.get(key)
+    return meant if meant in known else nearest_name(key, known)
+
+
 def _unknown_key(key: str, known: list[str]) -> str:
-    hint = nearest(key, known) or (f" (known: {', '.join(known)})" if known else "")
-    return f"unknown key{hint}"
+    if section := _SECTIONS.get(key):
+        return f"unknown key; it belongs in the section {section!r} of the grid"
+    if meant := _intended(key, known):
+        return f"unknown key; did you mean {meant!r}?"
+    names = f" (known: {', '.join(known)})" if known else ""
+    return f"unknown key{names}{'; an option goes below options' if 'options' in known else ''}"
 
 
 def model_in(annotation: Any) -> type[BaseModel] | None:

@@ -235,16 +235,26 @@ def load(store: SweepStore) -> Sweep:
 
 
 def load_episodes(
-    store: SweepStore, *, columns: Sequence[str] | None = None, phase: Phase | None = None
+    sweep: Sweep | SweepStore, *, columns: Sequence[str] | None = None, phase: Phase | None = None
 ) -> pd.DataFrame:
-    """Read all episodes: KEY, EPISODE_COLUMNS, cost_i, limit_i; one row per episode.
+    """Read all episodes of training: KEY, EPISODE_COLUMNS, cost_i, limit_i; one row per episode.
 
     Args:
-        store: the sweep's folder.
+        sweep: that ``recrl.load_sweep`` read from its folder, or its files.
         columns: only these columns besides KEY.
         phase: only the episodes that ended in this phase.
+
+    Raises:
+        RecrlError: the sweep is from an export or from MLflow, which have no single episodes of training.
     """
-    specs, trials = _trials(store)
+    if isinstance(sweep, Sweep):
+        if sweep.folder is None:
+            raise RecrlError(
+                f"{sweep.name}: an export and MLflow hold no single episodes of training; load the sweep "
+                "from the folder it ran in"
+            )
+        sweep = SweepStore(sweep.folder.parent, sweep.folder.name)
+    specs, trials = _trials(sweep)
 
     def rows(trial: TrialStore) -> pd.DataFrame:
         try:

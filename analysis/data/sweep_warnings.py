@@ -11,7 +11,7 @@ import pandas as pd
 
 from recrl.analysis.data.labels import KEY, listed
 from recrl.analysis.data.sweep_data import Sweep, TrialFacts
-from recrl.orchestrator.files.curriculum_warnings import (
+from recrl.orchestrator.files.trial_warnings import (
     HARD_LANDING,
     NAMED,
     hard_landing_sentence,

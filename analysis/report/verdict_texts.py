@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 import pandas as pd
@@ -88,8 +88,8 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
         "The return of an infeasible policy may be above the optimum: it is no success.",
         *([failed] if verdicts["failed"].any() else []),
         *([pending] if verdicts["pending"].any() else []),
-        f"The difference to none is a mean over the seeds that both have{interval}. It is left out where one "
-        "of these policies is infeasible, with the curriculum or with none.",
+        f"The difference to 'none' is a mean over the seeds that both have{interval}. It is left out where "
+        "one of these policies is infeasible, with the curriculum or with 'none'.",
         *([intervals] if intervals else []),
         f"The {DEPLOYMENT} averages many policies. It never enters a verdict.",
         *(sentence for flag, (_, sentence) in WARNINGS.items() if verdicts[flag].any()),
@@ -398,11 +398,11 @@ def _best(rows: pd.DataFrame, column: str) -> str:
         return ""
     each = " each" if len(best) > 1 else ""
     if len({_share(counts, method, column) for method in best}) > 1:  # equal shares of unequal numbers
-        text = f", most often with {_listed([f'{it} ({_share(counts, it, column)})' for it in best])}"
+        text = f", most often with {_listed([f'{it!r} ({_share(counts, it, column)})' for it in best])}"
     else:
-        text = f", most often with {_listed(best)} ({_share(counts, best[0], column)}{each})"
+        text = f", most often with {_listed(map(repr, best))} ({_share(counts, best[0], column)}{each})"
     if BASELINE in counts.index and BASELINE not in best:
-        text += f", against {_share(counts, BASELINE, column)} with {BASELINE}"
+        text += f", against {_share(counts, BASELINE, column)} with {BASELINE!r}"
     return text
 
 
@@ -426,7 +426,7 @@ def _violations(rows: pd.DataFrame, column: str) -> list[str]:
     parts, limit = [], _limit_text(rows)
     if always:
         chosen = rows[rows["method"].isin(always) & (rows["infeasible"] > 0)]
-        who = "every curriculum" if len(always) == len(counts) > 1 else _listed(always)
+        who = "every curriculum" if len(always) == len(counts) > 1 else _listed(map(repr, always))
         total = int(chosen["seeds"].sum())
         verb = "exceed" if len(always) > 1 and who != "every curriculum" else "exceeds"
         what = "policy" if total == 1 else "policies"
@@ -438,7 +438,7 @@ def _violations(rows: pd.DataFrame, column: str) -> list[str]:
         bad, total = int(count["infeasible"]), int(count["ended"])
         others = "the other exceeds" if total == 2 and count[column] else f"{bad} exceed{'s' * (bad == 1)}"
         parts.append(
-            f"{method} {done} {int(count[column])} of {total}, {others} {limit} by {_excess(chosen)}"
+            f"{str(method)!r} {done} {int(count[column])} of {total}, {others} {limit} by {_excess(chosen)}"
         )
         limit = "it" if limit != SOME_LIMIT else limit
     return parts
@@ -459,10 +459,11 @@ def _excess(rows: pd.DataFrame) -> str:
     return high if low == high else f"{low} to {high}"
 
 
-def _listed(names: Sequence[str]) -> str:
+def _listed(parts: Iterable[str]) -> str:
     """Join names in a sentence.
 
     >>> _listed(["a"]), _listed(["a", "b", "c"])
     ('a', 'a, b and c')
     """
+    names = list(parts)
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]])) if names else DASH

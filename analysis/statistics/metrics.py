@@ -30,7 +30,7 @@ from recrl.analysis.statistics.verdicts import is_cost, solved, tie, within_limi
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.spec import TrialStatus
 
-BASELINE = "none"  # the method that others are compared with
+BASELINE = "none"  # the method that others are compared with, where nothing else is said
 
 
 class Measure(StrEnum):
@@ -196,14 +196,17 @@ def robust_summary(rows: pd.DataFrame, generator: np.random.Generator) -> pd.Dat
     return pd.DataFrame(lines)
 
 
-def comparisons(rows: pd.DataFrame, generator: np.random.Generator) -> pd.DataFrame:
-    """Compare every method with BASELINE: one row per other GROUP and measure with a common seed.
+def comparisons(
+    rows: pd.DataFrame, generator: np.random.Generator, *, baseline: str = BASELINE
+) -> pd.DataFrame:
+    """Compare every method with one of them: one row per other GROUP and measure with a common seed.
 
     All pairs count, feasible or not. More return is a gain only where feasible_pairs equals pairs.
 
     Args:
         rows: of ``outcomes``.
         generator: draws the resamples.
+        baseline: name (label) of the method that the others are compared with.
 
     Returns:
         GROUP, measure, pairs (seeds that both have), feasible_pairs (those whose trials are both feasible);
@@ -211,15 +214,21 @@ def comparisons(rows: pd.DataFrame, generator: np.random.Generator) -> pd.DataFr
         and the same for cost_i_difference; then improvement, the probability that a run returns more
         than a run of the baseline (of these seeds; ties count half: ``verdicts.tie``), with its bootstrap
         interval _low, _high; and too_few_seeds (that interval is then too short).
+
+    Raises:
+        ValueError: no row has the given baseline. Without ``none`` the table is empty by default.
     """
+    if baseline != BASELINE and not (rows["method"] == baseline).any():
+        known = ", ".join(map(str, dict.fromkeys(rows["method"])))
+        raise ValueError(f"baseline: no complete trial has the method {baseline!r} (found: {known})")
     costs = [str(name) for name in rows if is_cost(str(name))]
     lines = []
     for (task, agent, method, measure), chosen in rows.groupby(
         [*GROUP, "measure"], observed=True, sort=False
     ):
         same = (rows["task"] == task) & (rows["agent"] == agent) & (rows["measure"] == measure)
-        others = rows[same & (rows["method"] == BASELINE)]
-        if method == BASELINE or not len(others):
+        others = rows[same & (rows["method"] == baseline)]
+        if method == baseline or not len(others):
             continue
         pairs = chosen.merge(others, on="seed", suffixes=("", "_base"))
         if not len(pairs):

@@ -9,7 +9,8 @@ from rich.console import Console
 
 from recrl.orchestrator.cli.output import say, short, show
 from recrl.orchestrator.cli.requests import EvaluateRequest
-from recrl.orchestrator.cli.sweeps import command_line, open_store
+from recrl.orchestrator.cli.sweeps import command_line, listed_trials, open_store
+from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -44,9 +45,10 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
     from recrl.orchestrator.trial.videos import VideoFormat  # noqa: PLC0415
 
     store = open_store(request, checkpoints=True)
+    chosen, orphans = _chosen(store, request)
     policies = tuple(FrozenPolicy) if request.policy == "both" else (FrozenPolicy(request.policy),)
     loaded, left_out = [], []
-    for trial in _chosen(store, request):
+    for trial in chosen:
         try:
             trial.require_whole()
             loaded.append(SavedTrial.load(trial))
@@ -76,6 +78,9 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
         say(console, f"Episodes   {short(path)}")
     for reason in left_out:
         say(console, f"left out   {reason}")
+    if orphans:
+        some = counted(orphans, "trial")
+        say(console, f"left out   {some} no longer in the grid; to evaluate one of them, name it by its id")
     _warn_of_other_code(evaluated, console)
     missing_videos = 0
     if request.video:
@@ -115,8 +120,12 @@ def _film(
     return failed
 
 
-def _chosen(store: SweepStore, request: EvaluateRequest) -> list[TrialStore]:
-    """Return the trials on disk by the beginning of their names and by ``--only``."""
+def _chosen(store: SweepStore, request: EvaluateRequest) -> tuple[list[TrialStore], int]:
+    """Return the trials on disk by the beginning of their names and by ``--only``.
+
+    Trials that the last launch's grid no longer has are left out unless they are named: they may have the
+    same task, agent, curriculum and seed as one of the grid. The second value is their number.
+    """
     text = " ".join(request.trial)
     found = store.find(text)
     only = parse_only(request.only)
@@ -127,10 +136,13 @@ def _chosen(store: SweepStore, request: EvaluateRequest) -> list[TrialStore]:
         except StorageError:
             damaged.add(trial.folder.name)
     kept = {spec.folder_name for spec in select(specs, only)} | (set() if only else damaged)
-    if not kept:
+    chosen = [trial for trial in found if trial.folder.name in kept]
+    listed = {spec.folder_name for spec in listed_trials(store)}
+    in_grid = [trial for trial in chosen if text or not listed or trial.folder.name in listed]
+    if not in_grid:
         begin = f" begin with {text!r}" if text else ""
         raise RecrlError(f"{store.name}: no trials on disk{begin}; see {command_line('status', store)}")
-    return [trial for trial in found if trial.folder.name in kept]
+    return in_grid, len(chosen) - len(in_grid)
 
 
 def _tell_mlflow(store: SweepStore, request: EvaluateRequest, console: Console) -> None:

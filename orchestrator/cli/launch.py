@@ -92,6 +92,9 @@ class _Printer(LaunchListener):
         """Print the plan; show the progress while trials run."""
         say_plan(plan, self._grid, self._console, at_once=at_once, where=where)
         say_other_code(plan, self._console)
+        if plan.orphans:
+            some = counted(len(plan.orphans), "trial")
+            say(self._console, f"no longer in the grid: {some}, kept on disk and left out of results")
         if not plan.to_do:
             yield
             return

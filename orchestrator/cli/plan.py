@@ -13,8 +13,8 @@ from recrl.orchestrator.cli.requests import GridRequest, PlanRequest, ValidateRe
 from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import UntrustedGridError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.curriculum_warnings import no_deployment_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_warnings import no_deployment_sentence, unknown_horizon_sentence
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.grid.only_selection import parse_only
@@ -43,7 +43,7 @@ def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
         f"{request.grid}: {grid.name} is right: {counted(len(grid.trials()), 'trial')}, from "
         f"tasks x agents x methods x seeds = {product}",
     )
-    _warn_of_deployment(grid.trials(), console)
+    _warn_of_steps(grid, grid.trials(), console)
     return ExitCode.OK
 
 
@@ -109,12 +109,14 @@ def say_plan(
     """Print what a launch would do, and its estimated time and memory."""
     say(console, f"{grid.name}: {display.plan_sentence(plan)}")
     say(console, display.estimate_sentence(estimate(plan, concurrent=at_once, speeds=speeds), where))
-    _warn_of_deployment(plan.to_do, console)
+    _warn_of_steps(grid, plan.to_do, console)
 
 
-def _warn_of_deployment(specs: Sequence[TrialSpec], console: Console) -> None:
-    """Print the warning about trials without a deployment phase."""
-    if sentence := no_deployment_sentence(specs):
+def _warn_of_steps(grid: GridSpec, specs: Sequence[TrialSpec], console: Console) -> None:
+    """Print the warnings about tasks of unknown horizon and about trials without a deployment phase."""
+    endless = [cell.task.label for cell in grid.tasks if cell.horizon is None]
+    sentences = (unknown_horizon_sentence(endless), no_deployment_sentence(specs))
+    for sentence in filter(None, sentences):
         say(console, f"warning: {sentence}")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import pandas as pd
@@ -45,7 +44,7 @@ def caption(rows: pd.DataFrame) -> str:
         rows: of ``verdict_counts.count_verdicts``.
     """
     several = int(rows["seeds"].max()) > 1
-    means = "means over n seeds, returns ± standard error" if several else "one seed (n = 1): no intervals"
+    means = "means over n seeds ± standard error" if several else "one seed (n = 1): no intervals"
     return (
         f"Final policies (stochastic), without learning, {measured_how(rows)}; {means}.\n"
         f"Verdicts: solved (feasible, and within {SOLVED_GAP} of the optimum), feasible, or infeasible by "
@@ -57,6 +56,6 @@ def _line(row: pd.Series, suffixes: Sequence[str]) -> dict[str, str]:
     line = names_of(row) | {"n": str(row["seeds"])}
     line["return"] = with_error(row["episode_return"], row["episode_return_se"])
     for i, which in enumerate(suffixes):
-        line[f"cost{which}"] = with_error(row[f"cost_{i}"], math.nan, digits=3)
+        line[f"cost{which}"] = with_error(row[f"cost_{i}"], row[f"cost_{i}_se"], digits=3)
         line[f"limit{which}"] = number(row[f"deploy_limit_{i}"])
     return line | {"verdict": verdict_text(row)}

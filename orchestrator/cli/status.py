@@ -12,20 +12,20 @@ from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import print_table, say, short
 from recrl.orchestrator.cli.plan import say_other_code
 from recrl.orchestrator.cli.requests import CheckRequest, LogsRequest, StatusRequest, StopRequest
-from recrl.orchestrator.cli.sweeps import command_line, open_place, open_store
+from recrl.orchestrator.cli.sweeps import command_line, listed_trials, open_place, open_store
 from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.curriculum_warnings import (
+from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.files.trial_warnings import (
     hard_landing_sentence,
     landed_hard,
     no_curriculum_sentence,
 )
-from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.launch_plan import make_plan
 from recrl.orchestrator.run_sweep import REQUEST_SECONDS
-from recrl.orchestrator.spec import TrialSpec, TrialStatus
+from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.sweep_progress import (
     DisplayStatus,
     SweepProgress,
@@ -80,7 +80,7 @@ def run_check(request: CheckRequest, console: Console) -> ExitCode:
     """Check every file of a sweep against its committed digest; print a line for each damaged one."""
     store = open_store(request)
     problems = [f"{store.name}: {problem}" for problem in store.damages()]
-    specs = _listed(store)
+    specs = listed_trials(store)
     problems += [f"{spec.title}: {it}" for spec in specs for it in store.trial(spec).damages()]
     listed = {spec.folder_name for spec in specs}
     orphans = [trial for trial in store.trials() if trial.folder.name not in listed]
@@ -109,14 +109,6 @@ def _is_lost(trial: TrialStore) -> bool:
         return trial.stated().status is TrialStatus.DAMAGED
     except StorageError:
         return False
-
-
-def _listed(store: SweepStore) -> list[TrialSpec]:
-    """Return the trials of the last launch; empty if the file that lists them is damaged."""
-    try:
-        return store.specs()
-    except StorageError:
-        return []
 
 
 def run_stop(request: StopRequest, console: Console) -> ExitCode:

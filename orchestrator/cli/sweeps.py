@@ -7,11 +7,13 @@ from pathlib import Path
 
 from recrl.orchestrator.cli.output import short
 from recrl.orchestrator.cli.requests import SweepRequest
+from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 from recrl.orchestrator.find_sweep import find_sweep
 from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.remote.remote_sweep import sweep_place
+from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.sweep_place import SweepPlace
 
 
@@ -26,6 +28,14 @@ def open_place(request: SweepRequest, *, checkpoints: bool = False) -> SweepPlac
 def open_store(request: SweepRequest, *, checkpoints: bool = False) -> SweepStore:
     """Return the folder of ``open_place``."""
     return open_place(request, checkpoints=checkpoints).store
+
+
+def listed_trials(store: SweepStore) -> list[TrialSpec]:
+    """Return the trials of the last launch; empty before it, or if the file that lists them is damaged."""
+    try:
+        return store.specs()
+    except StorageError:
+        return []
 
 
 def command_line(command: str, store: SweepStore, tracking_uri: str | None = None) -> str:

@@ -23,12 +23,14 @@ class TaskCell:
         train_limits: d_t, [k].
         deploy_limits: d_d, [k].
         rollout_steps: T.
+        horizon: most steps of an episode; None if unknown.
     """
 
     task: Choice
     train_limits: CostLimits
     deploy_limits: CostLimits
     rollout_steps: int
+    horizon: int | None
 
 
 @dataclass(frozen=True)

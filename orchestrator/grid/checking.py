@@ -237,7 +237,7 @@ class _Check:
             limits = self._both_limits(index, task.label, cmdp)
             rollout_steps = self._rollout_steps(run, task.label, cmdp)
             if limits is not None and rollout_steps is not None:
-                cells.append(TaskCell(task, *limits, rollout_steps))
+                cells.append(TaskCell(task, *limits, rollout_steps, cmdp.horizon))
         return cells
 
     def _choices(self, section: str, model: type[Entry], options_of: OptionsOf) -> dict[int, Choice]:

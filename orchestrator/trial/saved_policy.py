@@ -103,12 +103,7 @@ class SavedTrial:
             num_episodes: for each, at least 1.
             seed: of the environments and the policy, at least 0; None for the trial's own.
         """
-        try:
-            rows = evaluation_rows(
-                self.policy, self.spec, policies, num_episodes=num_episodes, seed=self._seed_sequence(seed)
-            )
-        except USERS_ERRORS as error:
-            raise RecrlError(f"{self.spec.title}: cannot be evaluated: {described(error)}") from error
+        rows = evaluated_rows(self.policy, self.spec, policies, num_episodes=num_episodes, seed=seed)
         path = self.store.evaluations_folder / f"{self._file_name(seed)}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
         text = rows_text(rows)
@@ -146,7 +141,7 @@ class SavedTrial:
                 environment,
                 policy,
                 num_costs=self.cmdp.num_costs,
-                seed=self._seed_sequence(seed),
+                seed=_seed_sequence(self.spec, seed),
                 every=every,
             )
             frames = (captioned(shot.frame, self._caption(shot)) for shot in shots)
@@ -171,9 +166,6 @@ class SavedTrial:
     def _file_name(self, seed: int | None) -> str:
         return f"update-{self.update:08d}__seed-{'own' if seed is None else seed}"
 
-    def _seed_sequence(self, seed: int | None) -> np.random.SeedSequence:
-        return TrialSeeds.of(self.spec).evaluation if seed is None else np.random.SeedSequence(seed)
-
     def _caption(self, shot: Shot) -> str:
         costs = ", ".join(
             f"{name} {cost:g} of {limit:g}"
@@ -182,6 +174,38 @@ class SavedTrial:
             )
         )
         return f"step {shot.step}   return {shot.episode_return:.1f}   {costs}"
+
+
+def evaluated_rows(
+    policy: FinalPolicy,
+    spec: TrialSpec,
+    policies: Sequence[FrozenPolicy],
+    *,
+    num_episodes: int,
+    seed: int | None,
+) -> list[dict[str, Any]]:
+    """Evaluate a policy on new environments of its trial; return the rows of ``trial.evaluation_rows``.
+
+    Args:
+        policy: chooses the actions.
+        spec: of the trial.
+        policies: stochastic, deterministic or both; at least one.
+        num_episodes: for each, at least 1.
+        seed: of the environments and the policy, at least 0; None for the trial's own.
+
+    Raises:
+        RecrlError: the task cannot be made, or its code raises an error.
+    """
+    try:
+        return evaluation_rows(
+            policy, spec, policies, num_episodes=num_episodes, seed=_seed_sequence(spec, seed)
+        )
+    except USERS_ERRORS as error:
+        raise RecrlError(f"{spec.title}: cannot be evaluated: {described(error)}") from error
+
+
+def _seed_sequence(spec: TrialSpec, seed: int | None) -> np.random.SeedSequence:
+    return TrialSeeds.of(spec).evaluation if seed is None else np.random.SeedSequence(seed)
 
 
 def summary(rows: pd.DataFrame, saved: SavedTrial) -> list[dict[str, Any]]:

@@ -18,6 +18,8 @@ from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 NO_POLICIES = "an export and MLflow hold no policies; load the sweep from the folder it ran in"
 
 if TYPE_CHECKING:
+    import gymnasium
+    import pandas as pd
     import torch
 
     from recrl.agents.agent import FinalPolicy
@@ -51,7 +53,9 @@ def load_sweep(
     Example:
         >>> import recrl
         >>> sweep = recrl.load_sweep("runs/demo")                      # doctest: +SKIP
-        >>> sweep.evaluations.groupby(["task", "method"])["cost_0"].mean()  # doctest: +SKIP
+        >>> final = sweep.evaluations.query("policy == 'stochastic'")   # doctest: +SKIP
+        >>> by = ["task", "agent", "method", "seed"]                    # doctest: +SKIP
+        >>> final.groupby(by, observed=True)["cost_0"].mean()           # doctest: +SKIP
     """
     from recrl.analysis.data import export, from_mlflow, sweep_data  # noqa: PLC0415
     from recrl.orchestrator.find_sweep import find_sweep  # noqa: PLC0415
@@ -226,6 +230,50 @@ class Policy:
         if rows.ndim == 2:
             return actions
         return int(actions[0]) if actions.ndim == 1 else actions[0]
+
+    def evaluate(
+        self, episodes: int = 100, *, seed: int | None = 0, deterministic: bool = False
+    ) -> pd.DataFrame:
+        """Run whole episodes on new environments of its task, without learning.
+
+        The environments have the task's options and the number of the trial. Each runs the same number of
+        episodes, give or take one: the first ones to end would mostly be short ones.
+
+        Args:
+            episodes: at least 1.
+            seed: of the environments and of the policy; None for that of the trial's own evaluation.
+            deterministic: whether to take the mode of the policy instead of a sample.
+
+        Returns:
+            index, length, episode_return, cost_i: one row per episode, undiscounted sums. ``recrl-sweep
+            evaluate`` finds the same with this seed.
+
+        Raises:
+            RecrlError: the task cannot be made, or its code raises an error.
+            ValueError: there are no episodes, or the seed is negative.
+
+        Example:
+            >>> policy.evaluate(500, seed=7)["cost_0"].agg(["mean", "sem"])  # doctest: +SKIP
+        """
+        import pandas as pd  # noqa: PLC0415
+
+        from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415
+        from recrl.orchestrator.trial.saved_policy import evaluated_rows  # noqa: PLC0415
+
+        if episodes < 1:
+            raise ValueError(f"episodes: must be at least 1, got {episodes}")
+        if seed is not None and seed < 0:
+            raise ValueError(f"seed: must be at least 0 or None, got {seed}")
+        kind = FrozenPolicy.DETERMINISTIC if deterministic else FrozenPolicy.STOCHASTIC
+        with modules_here():
+            rows = evaluated_rows(self.final, self.spec, (kind,), num_episodes=episodes, seed=seed)
+        return pd.DataFrame(rows).drop(columns="policy")
+
+    def make_env(self) -> gymnasium.Env[Any, Any]:
+        """Make its task, with the trial's options, as one Gymnasium environment (``recrl.make_env``)."""
+        from recrl._tasks import make_env  # noqa: PLC0415
+
+        return make_env(self.spec.task.name, **self.spec.task.options)
 
     def to_torch_module(self) -> torch.nn.Module:
         """Return a copy of the policy as a module, for ``torch.export`` and ONNX.

@@ -227,6 +227,20 @@ def test_without_a_baseline_there_is_nothing_to_compare(finished: Sweep) -> None
     assert not len(metrics.comparisons(rows[rows["method"] != "none"], np.random.default_rng(0)))
 
 
+def test_two_curricula_are_compared_with_each_other(finished: Sweep) -> None:
+    rows = metrics.outcomes(finished)
+    key = {"task": "river-a", "agent": "cpo", "measure": "stochastic"}
+    forth = only(metrics.comparisons(rows, np.random.default_rng(0)), method="linear", **key)
+    back = only(metrics.comparisons(rows, np.random.default_rng(0), baseline="linear"), method="none", **key)
+    for column in ("return_difference", "cost_0_difference"):
+        assert back[column] == pytest.approx(-forth[column])
+        assert back[f"{column}_low"] == pytest.approx(-forth[f"{column}_high"])
+    with pytest.raises(
+        ValueError, match=r"^baseline: no complete trial has the method 'linaer' \(found: none, "
+    ):
+        metrics.comparisons(rows, np.random.default_rng(0), baseline="linaer")
+
+
 def test_interquartile_means_carry_their_warning(finished: Sweep) -> None:
     rows = metrics.robust_summary(metrics.outcomes(finished), np.random.default_rng(0))
     assert rows["too_few_seeds"].all()

@@ -14,6 +14,7 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures.styles import STYLES
 from recrl.environments.cmdp import Phase
 from recrl.environments.registry import optimal_return
+from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.teachers.registry import TEACHERS
 
@@ -69,6 +70,10 @@ def test_episodes_of_one_phase_and_some_columns(finished_sweep: SweepStore) -> N
     assert list(rows.columns) == [*KEY, "end_step", "cost_0"]
     assert rows["end_step"].min() > 15_200
     assert len(sweep_data.load_episodes(finished_sweep)) > len(rows)
+    sweep = sweep_data.load(finished_sweep)
+    assert sweep_data.load_episodes(sweep).equals(sweep_data.load_episodes(finished_sweep))
+    with pytest.raises(RecrlError, match="an export and MLflow hold no single episodes of training"):
+        sweep_data.load_episodes(replace(sweep, folder=None))
 
 
 def test_a_running_sweep_shows_what_is_committed(made_up_sweep: Callable[..., SweepStore]) -> None:

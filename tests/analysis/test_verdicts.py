@@ -162,19 +162,19 @@ def test_one_seed_has_no_interval() -> None:
         (
             ROWS,
             "river: 3 of 6 final policies (1 agent x 3 curricula x 2 seeds) solve it, most often with "
-            "dynamic (2 of 2), against 1 of 2 with none; linear exceeds the limit of 5 by up to 2.00 (2 of 2 "
-            "policies).",
+            "'dynamic' (2 of 2), against 1 of 2 with 'none'; 'linear' exceeds the limit of 5 by up to 2.00 "
+            "(2 of 2 policies).",
         ),
         (ROWS[4:6], "river: all 2 final policies (1 agent x 1 curriculum x 2 seeds) solve it."),
         (
             ROWS[2:4],
-            "river: none of 2 final policies (1 agent x 1 curriculum x 2 seeds) solves it; linear exceeds "
+            "river: none of 2 final policies (1 agent x 1 curriculum x 2 seeds) solves it; 'linear' exceeds "
             "the limit of 5 by up to 2.00 (2 of 2 policies).",
         ),
         (
             [row | {"optimal_return": math.nan, "optimal": False} for row in ROWS[:4]],
             "river: 2 of 4 final policies (1 agent x 2 curricula x 2 seeds) are feasible, most often with "
-            "none (2 of 2); linear exceeds the limit of 5 by up to 2.00 (2 of 2 policies).",
+            "'none' (2 of 2); 'linear' exceeds the limit of 5 by up to 2.00 (2 of 2 policies).",
         ),
         ([row | {"optimal_return": -math.inf} for row in ROWS], "river: no policy keeps the limits."),
     ],
@@ -203,8 +203,8 @@ def test_the_best_curriculum_is_that_with_the_most_successes_of_all_its_trials()
     rows.append(outcome("dynamic", 0, 9.5, 5.0))
     failed = [outcome("dynamic", seed, 0.0, 0.0) for seed in (1, 2, 3)]
     assert verdict_texts.answers(judged(rows, failed=failed)) == [
-        "river: 4 of 8 trials (1 agent x 2 curricula x 4 seeds) solve it, most often with none (3 of 4); 3 "
-        "failed; none solves 3 of 4, 1 exceeds the limit of 5 by 1.00."
+        "river: 4 of 8 trials (1 agent x 2 curricula x 4 seeds) solve it, most often with 'none' (3 of 4); 3 "
+        "failed; 'none' solves 3 of 4, 1 exceeds the limit of 5 by 1.00."
     ]
 
 
@@ -304,9 +304,9 @@ def test_each_curriculum_that_violates_is_named_with_its_excess() -> None:
     ]
     assert verdict_texts.answers(judged(rows)) == [
         "One seed (n = 1): no intervals, and another seed may give another verdict.",
-        "river: 3 of 8 final policies (2 agents x 4 curricula x 1 seed) solve it, most often with none (2 of "
-        "2); linear and cosine exceed the limit of 5 by 4.00 to 4.06 (4 of 4 policies); dynamic solves 1 of "
-        "2, the other exceeds it by 0.084.",
+        "river: 3 of 8 final policies (2 agents x 4 curricula x 1 seed) solve it, most often with 'none' (2 "
+        "of 2); 'linear' and 'cosine' exceed the limit of 5 by 4.00 to 4.06 (4 of 4 policies); 'dynamic' "
+        "solves 1 of 2, the other exceeds it by 0.084.",
     ]
 
 

@@ -843,8 +843,33 @@ def test_a_grid_too_short_for_a_deployment_phase_is_a_warning(
         assert main([command, "grid.yaml"]) == ExitCode.OK
         assert (
             "warning: the deployment phase is shorter than an update, so that no update learns under d_d: "
-            "two-state ppo-lag none seed 0, two-state ppo-lag linear seed 0; take more total_steps or a "
-            "larger deploy_fraction"
+            "two-state ppo-lag none seed 0, two-state ppo-lag linear seed 0; take 5 times the "
+            "total_steps or a larger deploy_fraction"
+        ) in capsys.readouterr().out.splitlines()
+
+
+def test_a_task_that_does_not_say_how_long_an_episode_may_be_is_a_warning(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "endless.py").write_text(
+        "import gymnasium\n"
+        "class Room(gymnasium.Env):\n"
+        "    observation_space = gymnasium.spaces.Box(0.0, 1.0, (1,))\n"
+        "    action_space = gymnasium.spaces.Discrete(2)\n"
+        "    def reset(self, *, seed=None, options=None):\n"
+        "        super().reset(seed=seed)\n"
+        "        return self.observation_space.low, {}\n"
+        "    def step(self, action):\n"
+        "        return self.observation_space.low, 1.0, False, False, {'cost': 0.0}\n"
+    )
+    (folder / "grid.yaml").write_text(
+        GRID.replace("{name: two-state,", "{name: 'endless:Room', label: room,")
+    )
+    for command in ("validate", "plan"):
+        assert main([command, "grid.yaml", "--trust"]) == ExitCode.OK
+        assert (
+            "warning: unknown horizon, and an episode that never ends gives no result: room; let step return "
+            "truncated=True, and give max_episode_steps or TimeLimit"
         ) in capsys.readouterr().out.splitlines()
 
 
@@ -881,6 +906,26 @@ def test_evaluate_shows_what_it_could_evaluate(
     assert any(line.startswith("Episodes") for line in lines)
     assert "left out   no luck" in lines
     assert main(["evaluate", "small", "--only", "method=linear"]) == ExitCode.WRONG_INPUT
+
+
+def test_evaluate_leaves_out_trials_that_the_grid_no_longer_has(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Their task, agent, curriculum and seed may be those of a trial of the grid."""
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    (before, _) = SweepStore(folder / "runs", "small").specs()
+    (folder / "grid.yaml").write_text(GRID.replace("total_steps: 160", "total_steps: 240"))
+    capsys.readouterr()
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    assert (
+        "no longer in the grid: 2 trials, kept on disk and left out of results\n" in capsys.readouterr().out
+    )
+    assert main(["evaluate", "small", "--only", "method=none"]) == ExitCode.OK
+    shown = capsys.readouterr().out
+    assert shown.count("two-state ppo-lag none seed 0") == 2  # stochastic and deterministic
+    assert "left out   1 trial no longer in the grid; to evaluate one of them, name it by its id\n" in shown
+    assert main(["evaluate", "small", before.trial_id, "--policy", "stochastic"]) == ExitCode.OK
+    assert before.folder_name in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", ["a.zip", "b.yaml", "c.YML"])

@@ -19,8 +19,8 @@ from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
-from recrl.orchestrator.files.curriculum_warnings import no_curriculum_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_warnings import no_curriculum_sentence
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.launch_plan import PlannedAction, TrialSelection, make_plan

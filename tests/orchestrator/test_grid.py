@@ -83,6 +83,22 @@ def test_ten_mistakes_give_ten_located_sentences() -> None:
         ("agents: [", "agent: [", "3: agent: unknown key; did you mean 'agents'?"),
         ("methods: [", "metods: [", "4: metods: unknown key; did you mean 'methods'?"),
         ("run: {", "runs: {", "6: runs: unknown key; did you mean 'run'?"),
+        ("methods: [", "curricula: [", "4: curricula: unknown key; did you mean 'methods'?"),
+        (
+            "[ppo-lag]",
+            "[{name: ppo-lag, options: {gamma: 0.9}}]",
+            "3: agents.0.options.gamma: unknown key; did you mean 'discount'?",
+        ),
+        (
+            "[ppo-lag]",
+            "[{name: ppo-lag, activation: tanh}]",
+            "3: agents.0.activation: unknown key (known: name, label, options); an option goes below options",
+        ),
+        (
+            "[ppo-lag]",
+            "[{name: ppo-lag, options: {num_envs: 8}}]",
+            "3: agents.0.options.num_envs: unknown key; it belongs in the section 'run' of the grid",
+        ),
         ("{total_steps", "{total_step", "6: run.total_step: unknown key; did you mean 'total_steps'?"),
         ("{name: two", "{nam: two", "2: tasks.0.nam: unknown key; did you mean 'name'?"),
         (

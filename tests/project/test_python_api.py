@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -308,6 +309,32 @@ def test_a_loaded_policy_repeats_the_trials_evaluation(folder: Path) -> None:
         observations, rewards, *_ = envs.step(training.policy.act(observations, deterministic=True))
         total += rewards
     assert total.mean() == pytest.approx(told, rel=0.05)
+
+
+def test_a_policy_is_evaluated_as_by_its_trial_and_the_command(folder: Path) -> None:
+    training = train(task={"name": "rivergrid-1a", "options": {"horizon": 30}}, folder="one")
+    told = training.evaluations.query("policy == 'stochastic'")
+    rows = training.policy.evaluate(len(told), seed=None)
+    shared = ["index", "length", "episode_return", "cost_0"]
+    assert list(rows.columns) == shared
+    np.testing.assert_array_equal(rows[shared].to_numpy(), told[shared].to_numpy())
+    assert main(["evaluate", "one", "--root", ".", "--episodes", "5", "--seed", "7"]) == 0
+    (written,) = folder.glob("one/trials/*/evaluations/*seed-7.csv")
+    both = pd.read_csv(written)
+    for deterministic, kind in ((False, "stochastic"), (True, "deterministic")):
+        rows = training.policy.evaluate(5, seed=7, deterministic=deterministic)
+        np.testing.assert_array_equal(
+            rows[shared].to_numpy(), both[both["policy"] == kind][shared].to_numpy()
+        )
+    assert rows["length"].max() <= 30
+    with pytest.raises(ValueError, match="episodes: must be at least 1, got 0"):
+        training.policy.evaluate(0)
+    with pytest.raises(ValueError, match="seed: must be at least 0 or None, got -1"):
+        training.policy.evaluate(seed=-1)
+    environment = training.policy.make_env()
+    environment.reset(seed=0)
+    ends = [environment.step(0)[3] for _ in range(30)]
+    assert ends == [False] * 29 + [True]
 
 
 def test_folders_that_hold_no_trial_are_refused(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Trials whose curriculum had no effect, or ended far above the deployment limit d_d."""
+"""Warnings about trials: a curriculum without effect or with a hard landing, too few steps, endless tasks."""
 
 from __future__ import annotations
 
@@ -36,8 +36,18 @@ def hard_landing_sentence(titles: Sequence[str]) -> str:
 def no_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
     """Return the warning about trials without an update in the deployment phase; empty for none."""
     what = "the deployment phase is shorter than an update, so that no update learns under d_d"
-    titles = [spec.title for spec in specs if spec.lacks_deployment]
-    return _warning(what, titles, "take more total_steps or a larger deploy_fraction")
+    short = [spec for spec in specs if spec.lacks_deployment]
+    if not short:
+        return ""
+    times = max(-(-spec.steps_per_update // spec.deploy_steps) for spec in short)
+    remedy = f"take {times} times the total_steps or a larger deploy_fraction"
+    return _warning(what, [spec.title for spec in short], remedy)
+
+
+def unknown_horizon_sentence(tasks: Sequence[str]) -> str:
+    """Return the warning about tasks that do not say how long an episode may be; empty for none."""
+    what = "unknown horizon, and an episode that never ends gives no result"
+    return _warning(what, tasks, "let step return truncated=True, and give max_episode_steps or TimeLimit")
 
 
 def _warning(what: str, titles: Sequence[str], remedy: str) -> str:
