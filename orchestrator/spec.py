@@ -40,6 +40,9 @@ class TrialStatus(StrEnum):
         return self in (TrialStatus.COMPLETE, TrialStatus.FAILED)
 
 
+MEASURING_NOTHING = ("none", "step", "unconstrained", "cooling")  # curricula, whatever d_t is
+
+
 @dataclass(frozen=True)
 class Choice:
     """A task, agent or curriculum chosen in a grid.
@@ -139,8 +142,8 @@ class TrialSpec:
         Args:
             start_limits: the measured d_t, [k]; None if it was not measured.
         """
-        is_measured = not all(map(math.isfinite, self.train_limits)) and self.method.name != "none"
-        if start_limits is None or not is_measured:
+        is_given = all(map(math.isfinite, self.train_limits))
+        if start_limits is None or is_given or self.method.name in MEASURING_NOTHING:
             return False
         pairs = zip(start_limits, self.deploy_limits, strict=True)
         return all(float(start) <= deploy for start, deploy in pairs)

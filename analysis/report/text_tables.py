@@ -152,8 +152,8 @@ def _mean(limits: Sequence[float] | np.ndarray) -> str:
 
 def _reached(training: pd.DataFrame, limits: np.ndarray, deploy: float) -> str:
     """Return when a limit first equals d_d, as a percentage of the training phase."""
-    steps = training.loc[limits <= deploy, "end_step"]
-    return f"{steps.iloc[0] / training['end_step'].iloc[-1]:.0%}" if len(steps) else "at its end"
+    begins = training["end_step"].shift(fill_value=0)[limits <= deploy]
+    return f"{begins.iloc[0] / training['end_step'].iloc[-1]:.0%}" if len(begins) else "at its end"
 
 
 def _times(noise: pd.Series) -> str:

@@ -15,7 +15,7 @@ from recrl.analysis.report.table_formats import not_corrected, with_interval
 from recrl.analysis.statistics.verdicts import COST_TOLERANCE, SOLVED_GAP, is_cost
 from recrl.environments.registry import TASKS
 from recrl.orchestrator.files.outcomes_file import FAILED, FEASIBLE, INFEASIBLE, PENDING, SOLVED
-from recrl.orchestrator.spec import TrialStatus
+from recrl.orchestrator.spec import MEASURING_NOTHING, TrialStatus
 
 DEPLOYMENT = "deployment phase (learning goes on)"
 BASELINE = "none"
@@ -166,7 +166,8 @@ def _training_limits(trials: pd.DataFrame, i: int) -> str:
     """
     trials = trials[trials["method_name"] != BASELINE]  # without a curriculum the limit is d_d throughout
     given, start = trials[f"train_limit_{i}"], trials[f"start_limit_{i}"]
-    measured = start[np.isinf(given) & np.isfinite(start)]
+    measures = ~trials["method_name"].isin(MEASURING_NOTHING)
+    measured = start[measures & np.isinf(given) & np.isfinite(start)]
     given = given[np.isfinite(given)]
     parts = [(measured, "measured at the start of training"), (given, "from the grid")]
     return ", and ".join(f"{_range(values)}, {how}" for values, how in parts if len(values))

@@ -191,10 +191,10 @@ def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.
     """
     if not budget >= 0.0:
         raise RecrlError(f"--budget: must be at least 0, got {budget:g}")
-    names = {str(label): str(name) for label, name in sweep.trials[["method", "method_name"]].to_numpy()}
+    names = {tuple(group): str(name) for *group, name in sweep.trials[[*GROUP, "method_name"]].to_numpy()}
     lines = []
     for group, runs in rows.groupby(list(GROUP), observed=True, sort=False):
-        if (curriculum := names[str(group[2])]) not in DECAYS:
+        if (curriculum := names[group]) not in DECAYS:
             continue
         policies, episodes = int(runs["policies"].iloc[0]), float(runs["episodes_per_policy"].mean())
         if not episodes:  # no episode finished in the training phase

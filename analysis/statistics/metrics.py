@@ -250,7 +250,10 @@ def comparisons(
             tie=tie(float(chosen["optimal_return"].iloc[0])),
         )
         lines.append(line | _ends("improvement", improvement) | {"too_few_seeds": improvement.is_small})
-    return pd.DataFrame(lines)
+    differing = [f"{name}_difference" for name in ("return", *costs)]
+    ends = [f"{name}{end}" for name in (*differing, "improvement") for end in ("", "_low", "_high")]
+    columns = [*GROUP, "measure", "pairs", "feasible_pairs", *ends, "too_few_seeds"]
+    return pd.DataFrame(lines, columns=columns)
 
 
 def _ends(name: str, interval: Interval) -> dict[str, float]:

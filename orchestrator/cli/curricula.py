@@ -109,7 +109,8 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
         "after which the limit is the deployment limit.",
     )
     for i in range(max(len(run.spec.deploy_limits) for run in runs)):
-        figure = replayed_limits(runs, method.label, cost=i)
+        with_cost = [run for run in runs if len(run.spec.deploy_limits) > i]
+        figure = replayed_limits(with_cost, method.label, cost=i)
         _, picture = styles.save(figure, folder, f"{method.file_name}_cost-{i}" if i else method.file_name)
         say(console, f"Figure        {short(picture)}")
     say(console, f"Every update  {short(folder)}")

@@ -123,8 +123,8 @@ def _film(
 def _chosen(store: SweepStore, request: EvaluateRequest) -> tuple[list[TrialStore], int]:
     """Return the trials on disk by the beginning of their names and by ``--only``.
 
-    Trials that the last launch's grid no longer has are left out unless they are named: they may have the
-    same task, agent, curriculum and seed as one of the grid. The second value is their number.
+    Trials that the last launch's grid no longer has are left out unless they are named. Their task, agent,
+    curriculum and seed may be those of a trial of the grid. The second value is their number.
     """
     text = " ".join(request.trial)
     found = store.find(text)

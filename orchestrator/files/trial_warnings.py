@@ -39,7 +39,7 @@ def no_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
     short = [spec for spec in specs if spec.lacks_deployment]
     if not short:
         return ""
-    times = max(-(-spec.steps_per_update // spec.deploy_steps) for spec in short)
+    times = 1 + max(spec.steps_per_update // spec.deploy_steps for spec in short)  # deploy_steps is rounded
     remedy = f"take {times} times the total_steps or a larger deploy_fraction"
     return _warning(what, [spec.title for spec in short], remedy)
 

@@ -6,10 +6,7 @@ import math
 from collections.abc import Iterator
 
 from recrl.environments.cmdp import CMDPSpec
-from recrl.orchestrator.spec import TrialSpec
-
-# Methods that measure nothing, whatever d_t is.
-MEASURING_NOTHING = ("none", "step", "unconstrained", "cooling")
+from recrl.orchestrator.spec import MEASURING_NOTHING, TrialSpec
 
 
 def unsuitable(trial: TrialSpec, cmdp: CMDPSpec) -> Iterator[tuple[str, str]]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from recrl.environments.vector import CMDPVectorEnv
 
 
-def make(task: str, num_envs: int = 1, **options: Any) -> CMDPVectorEnv:
+def make(task: str, /, num_envs: int = 1, **options: Any) -> CMDPVectorEnv:
     """Make a task as a Gymnasium vector environment.
 
     Args:
@@ -49,7 +49,7 @@ def make(task: str, num_envs: int = 1, **options: Any) -> CMDPVectorEnv:
             return make_vector(task, num_envs, options=options)
 
 
-def make_env(task: str, **options: Any) -> gymnasium.Env[Any, Any]:
+def make_env(task: str, /, **options: Any) -> gymnasium.Env[Any, Any]:
     """Make a task as one Gymnasium environment, with rendering (``render()`` is RGB).
 
     Args:

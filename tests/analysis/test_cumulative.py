@@ -123,6 +123,19 @@ def test_a_budget_is_spent_by_the_limit_it_allows(finished: Sweep) -> None:
     assert table["largest d_t"].tolist() == ["none"]
 
 
+def test_a_label_may_be_another_curriculum_on_another_task(finished: Sweep) -> None:
+    """As in merged files; ``unconstrained`` has no bound, and is left out."""
+    sweep = three_policies(finished)
+    rows = cumulative_cost.cumulative_costs(sweep)
+    other = sweep.trials.assign(task="other", method_name="unconstrained")
+    for trials in ([sweep.trials, other], [other, sweep.trials]):
+        both = dataclasses.replace(sweep, trials=pd.concat(trials, ignore_index=True))
+        found = cumulative_cost.admissible_limits(
+            pd.concat([rows, rows.assign(task="other")]), both, budget=80.0
+        )
+        assert found["task"].tolist() == rows["task"].tolist()
+
+
 def test_a_budget_takes_the_worst_of_several_runs(finished: Sweep) -> None:
     sweep = three_policies(finished)
     row = cumulative_cost.cumulative_costs(sweep)

@@ -224,7 +224,9 @@ def test_equally_good_policies_tie_where_the_optimum_is_known(finished: Sweep) -
 
 def test_without_a_baseline_there_is_nothing_to_compare(finished: Sweep) -> None:
     rows = metrics.outcomes(finished)
-    assert not len(metrics.comparisons(rows[rows["method"] != "none"], np.random.default_rng(0)))
+    nothing = metrics.comparisons(rows[rows["method"] != "none"], np.random.default_rng(0))
+    assert not len(nothing)
+    assert list(nothing) == list(metrics.comparisons(rows, np.random.default_rng(0)))
 
 
 def test_two_curricula_are_compared_with_each_other(finished: Sweep) -> None:

@@ -344,6 +344,9 @@ def test_only_a_measured_training_limit_is_said_to_be_measured(
     table = judged([outcome("linear", 0, 9.5, 5.0, task="river-a")])
     (sentence,) = verdict_texts.task_sentences(dataclasses.replace(finished, trials=trials), table)
     assert sentence.endswith(f"allowed 5.05 (1%, exact).{said}")
+    cooled = trials.assign(method_name="cooling", train_limit_0=math.inf, start_limit_0=2.5)
+    (sentence,) = verdict_texts.task_sentences(dataclasses.replace(finished, trials=cooled), table)
+    assert "measured" not in sentence
 
 
 def test_violators_are_marked_by_text_and_colour() -> None:

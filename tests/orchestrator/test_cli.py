@@ -843,7 +843,7 @@ def test_a_grid_too_short_for_a_deployment_phase_is_a_warning(
         assert main([command, "grid.yaml"]) == ExitCode.OK
         assert (
             "warning: the deployment phase is shorter than an update, so that no update learns under d_d: "
-            "two-state ppo-lag none seed 0, two-state ppo-lag linear seed 0; take 5 times the "
+            "two-state ppo-lag none seed 0, two-state ppo-lag linear seed 0; take 6 times the "
             "total_steps or a larger deploy_fraction"
         ) in capsys.readouterr().out.splitlines()
 
@@ -871,6 +871,17 @@ def test_a_task_that_does_not_say_how_long_an_episode_may_be_is_a_warning(
             "warning: unknown horizon, and an episode that never ends gives no result: room; let step return "
             "truncated=True, and give max_episode_steps or TimeLimit"
         ) in capsys.readouterr().out.splitlines()
+
+
+def test_replay_draws_each_cost_of_the_tasks_that_have_it(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    both = "tasks: [{name: two-state, deploy_limits: 2}, {name: two-state-2, deploy_limits: [2, 2]}]"
+    (folder / "grid.yaml").write_text(GRID.replace("tasks: [{name: two-state, deploy_limits: 2}]", both))
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
+    capsys.readouterr()
+    assert main(["replay", "small", "--teacher", "linear", "--only", "method=none"]) == ExitCode.OK
+    assert capsys.readouterr().out.count("Figure ") == 2
 
 
 def test_replay_leaves_out_a_trial_that_has_saved_nothing_yet(

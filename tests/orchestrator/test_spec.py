@@ -64,5 +64,13 @@ def test_folder_name_is_safe_and_readable() -> None:
     assert SPEC.folder_name == f"rivergrid-1a__ppo-lag__dynamic-80__s3__{SPEC.trial_id}"
 
 
+def test_only_a_curriculum_that_measures_d_t_can_find_it_too_low() -> None:
+    """``cooling`` without relaxation begins at d_d, and measures nothing."""
+    unlimited = replace(SPEC, train_limits=CostLimits((math.inf,)), deploy_limits=CostLimits((2.0,)))
+    for name, is_none in (("linear", True), ("dynamic", True), ("cooling", False), ("none", False)):
+        assert replace(unlimited, method=Choice(name)).is_no_curriculum([1.5]) == is_none
+    assert not replace(unlimited, method=Choice("linear")).is_no_curriculum([3.0])
+
+
 def test_only_complete_and_failed_are_finished() -> None:
     assert [state for state in TrialStatus if state.is_finished] == [TrialStatus.COMPLETE, TrialStatus.FAILED]

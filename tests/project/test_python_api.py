@@ -396,6 +396,14 @@ def test_tasks_say_what_is_wrong() -> None:
         recrl.make_env("two-state")
 
 
+def test_a_task_may_have_an_option_called_task(folder: Path) -> None:
+    (folder / "named.py").write_text(
+        OWN_TASK.replace("def make(render_mode=None):", "def make(task=1, render_mode=None):")
+    )
+    for made in (recrl.make("named:make", task=2), recrl.make_env("named:make", task=2)):
+        made.close()
+
+
 def test_costs_of_a_single_environment_are_a_vector(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / "column_room.py").write_text(OWN_TASK.replace('"cost": 1.0', '"cost": np.ones((1, 1))'))
     monkeypatch.syspath_prepend(str(folder))
