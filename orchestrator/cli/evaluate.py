@@ -79,8 +79,7 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
     for reason in left_out:
         say(console, f"left out   {reason}")
     if orphans:
-        some = counted(orphans, "trial")
-        say(console, f"left out   {some} no longer in the grid; to evaluate one of them, name it by its id")
+        say(console, f"left out   {_no_longer(orphans)}")
     _warn_of_other_code(evaluated, console)
     missing_videos = 0
     if request.video:
@@ -139,10 +138,18 @@ def _chosen(store: SweepStore, request: EvaluateRequest) -> tuple[list[TrialStor
     chosen = [trial for trial in found if trial.folder.name in kept]
     listed = {spec.folder_name for spec in listed_trials(store)}
     in_grid = [trial for trial in chosen if text or not listed or trial.folder.name in listed]
+    orphans = len(chosen) - len(in_grid)
+    if not in_grid and orphans:
+        raise RecrlError(f"{store.name}: {_no_longer(orphans)}")
     if not in_grid:
         begin = f" begin with {text!r}" if text else ""
         raise RecrlError(f"{store.name}: no trials on disk{begin}; see {command_line('status', store)}")
-    return in_grid, len(chosen) - len(in_grid)
+    return in_grid, orphans
+
+
+def _no_longer(orphans: int) -> str:
+    """Say how many trials are left out, and how to evaluate them."""
+    return f"{counted(orphans, 'trial')} no longer in the grid; to evaluate one of them, name it by its id"
 
 
 def _tell_mlflow(store: SweepStore, request: EvaluateRequest, console: Console) -> None:

@@ -937,6 +937,12 @@ def test_evaluate_leaves_out_trials_that_the_grid_no_longer_has(
     assert "left out   1 trial no longer in the grid; to evaluate one of them, name it by its id\n" in shown
     assert main(["evaluate", "small", before.trial_id, "--policy", "stochastic"]) == ExitCode.OK
     assert before.folder_name in capsys.readouterr().out
+    (folder / "grid.yaml").write_text(GRID.replace("methods: [none, linear]", "methods: [cosine]"))
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    assert main(["evaluate", "small", "--only", "method=none"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err == (
+        "recrl-sweep: small: 2 trials no longer in the grid; to evaluate one of them, name it by its id\n"
+    )
 
 
 @pytest.mark.parametrize("name", ["a.zip", "b.yaml", "c.YML"])

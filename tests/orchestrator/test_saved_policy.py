@@ -323,6 +323,7 @@ def test_evaluate_leaves_out_what_has_no_checkpoint(
     root = str(complete.folder.parents[2])
     store = SweepStore(Path(root), "small")
     begun = replace(SPEC, seed=6)
+    store.write_specs([SPEC, begun])
     store.trial(begun).begin(begun)
     assert main(["evaluate", "--root", root]) == ExitCode.TRIALS_FAILED
     sentence = "two-state ppo-lag none seed 6: has no intact checkpoint yet\n"
