@@ -245,8 +245,8 @@ class Policy:
             deterministic: whether to take the mode of the policy instead of a sample.
 
         Returns:
-            One row per episode with index, length, episode_return and cost_i, undiscounted sums. They are those
-            of ``recrl-sweep evaluate`` with this seed.
+            One row per episode with index, length, episode_return and cost_i, undiscounted sums. They are
+            those of ``recrl-sweep evaluate`` with this seed.
 
         Raises:
             RecrlError: the task cannot be made, or its code raises an error.
