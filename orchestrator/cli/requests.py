@@ -210,8 +210,8 @@ class EvaluateRequest(SweepRequest):
     trial: tuple[str, ...] = by_place(
         nargs="*",
         metavar="TRIAL",
-        help="the beginning of its id, title or folder, or of several; by default all of the grid that have a "
-        "checkpoint",
+        help="the beginning of its id, title or folder, or of several; by default all of the grid that have "
+        "a checkpoint",
     )
     only: tuple[str, ...] = by_flag(**_ONLY)
     trust: bool = by_flag(**_TRUST)
