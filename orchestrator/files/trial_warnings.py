@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 
 from recrl.orchestrator.spec import TrialSpec
@@ -39,7 +40,8 @@ def no_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
     short = [spec for spec in specs if spec.lacks_deployment]
     if not short:
         return ""
-    times = 1 + max(spec.steps_per_update // spec.deploy_steps for spec in short)  # deploy_steps is rounded
+    rounding = 0.5  # of deploy_steps
+    times = max(math.ceil(spec.steps_per_update / (spec.deploy_steps - rounding)) for spec in short)
     remedy = f"take {times} times the total_steps or a larger deploy_fraction"
     return _warning(what, [spec.title for spec in short], remedy)
 
