@@ -23,7 +23,8 @@ class WindowStatistics:
     """Statistics of the episodes that finished over some consecutive policy updates.
 
     Attributes:
-        env_steps: environment steps taken in these updates, over all the trial's environments.
+        env_steps: environment steps of these updates in which finished episodes count, over all the trial's
+            environments.
         episodes: number of finished episodes, n; if it is 0, the means are 0 and not meaningful.
         mean_return: r-bar, the mean undiscounted return.
         mean_costs: C-bar, the mean undiscounted episode costs, [k].

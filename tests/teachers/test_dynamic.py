@@ -792,3 +792,26 @@ def test_the_remaining_steps_allow_for_an_episode_before_each_window() -> None:
         for duration in (0, 1000, 4000)
     ]
     assert left == [18, 8, 2]  # 20 - 2; (20 - 3) / 2; (20 - 6) / 5
+
+
+@pytest.mark.parametrize("options", [{"window": 5}, {"window": 20, "window_unit": "episodes"}])
+def test_the_remaining_episodes_are_those_to_come_though_some_do_not_count(options: dict[str, Any]) -> None:
+    """64 environments of 64 steps an update, 1,000 steps an episode: 4 end per update, at the limit's cost."""
+    budget = 1_900_000
+    teacher = teacher_of(budget, remaining="episodes", overlapping_episodes="ignore", **options)
+    step, state = teacher.start()
+    steps_left_of = []
+    for update in range(1, 200):
+        begin, limit = 4096 * (update - 1), step.limits[0]
+        ends = [begin + 64 * done for done in range(1, 5)] if update > 15 else []
+        episodes = tuple(
+            EpisodeStats(0, Phase.TRAINING, end, 1000, 10.0, (limit,), step.limits, 0.0, end - 64_000)
+            for end in ends
+        )
+        step, state = teacher.step(state, ProgressReport(update, 4096 * update, episodes))
+        if step.limits[0] != limit:
+            divisor = (limit - 25.0) / (limit - step.limits[0])
+            steps_left_of.append((divisor, (budget - 4096 * update) / 1024 - 1))
+    assert len(steps_left_of) >= 5
+    for divisor, episodes_to_come in steps_left_of:
+        assert divisor == pytest.approx(episodes_to_come, rel=0.15)
