@@ -37,8 +37,8 @@ literal pseudocode wherever it is defined.
   that began before it: they may look converged and above the new limit. So no episode counts that ends within
   the duration of the longest one after a change. If all that began after the change did count, the first ones
   to end would be the short ones, which are often the cheap ones. The next decision comes later by that
-  duration, so the remaining budget has fewer steps of line 7. A window has only the environment steps in which
-  episodes count, so that its number of episodes per step is right (``overlapping_episodes``).
+  duration, so the remaining budget has fewer steps of line 7. A window has only the environment steps in
+  which episodes count, so that its number of episodes per step is right (``overlapping_episodes``).
 - *last_change* is reset when limits or policy have changed. Line 11 also resets it when neither has, that is,
   whenever the agent has converged. With a limit of d_d or noise of 0 that delays the next test by a window
   (``clock_reset``).

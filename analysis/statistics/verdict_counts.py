@@ -15,7 +15,7 @@ import pandas as pd
 
 from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.statistics.metrics import Measure
-from recrl.analysis.statistics.verdicts import is_cost, within_limit
+from recrl.analysis.statistics.verdicts import is_cost, worst_costs
 from recrl.orchestrator.files.outcomes_file import VERDICT_MEASURE
 from recrl.orchestrator.spec import TrialStatus
 
@@ -43,7 +43,8 @@ def count_verdicts(
         planned (all trials), failed, pending (neither complete nor failed: they wait, run or are damaged);
         worst_excess (the largest cost above its limit among the infeasible seeds, or NaN; of several costs
         the one furthest above its limit, as a fraction of the limit); worst_share (the same divided by that
-        limit); for several costs worst_cost (the name of that cost, or empty) and cost_name_i;
+        limit); for several costs worst_cost (the name of that cost, or empty) and cost_name_i (empty if the
+        task has no cost i);
         episode_return and cost_i (means over seeds, with standard errors _se; NaN for one seed);
         deploy_limit_i, optimal_return, exact (whether every seed is; false without a seed), episodes (of a
         seed); deployment_return and deployment_cost_i (likewise, with _se); no_curriculum and hard_landing
@@ -61,10 +62,10 @@ def count_verdicts(
         seeds = evaluated.get(group, final.iloc[:0])
         line = dict(zip(GROUP, group, strict=True)) | _counts(seeds) | _states(planned["status"])
         task = str(group[0])
-        named = dict(zip(costs, (names or {}).get(task, ()), strict=False)) or {
-            name: name.removeprefix("cost_") for name in costs
-        }
         limits = {name: float(planned[f"deploy_{name.replace('cost', 'limit')}"].iloc[0]) for name in costs}
+        named = dict(zip(costs, (names or {}).get(task, ()), strict=False)) or {
+            name: name.removeprefix("cost_") for name, limit in limits.items() if not math.isnan(limit)
+        }
         line |= _worst(seeds, limits, named)
         for name in ("episode_return", *costs):
             line |= {name: seeds[name].mean(), f"{name}_se": seeds[name].sem()}
@@ -106,17 +107,16 @@ def _worst(
 ) -> dict[str, float | str]:
     """Return the largest excess among the infeasible seeds, its fraction of the limit, and its cost.
 
-    Costs may have different units, so the fractions are compared. Any excess of a limit of 0 is the largest.
+    It is chosen as in ``verdicts.worst_costs``.
     """
     found: dict[str, float | str] = {"worst_excess": math.nan, "worst_share": math.nan}
-    largest, cost = 0.0, ""
-    for name, limit in limits.items():
-        broken = seeds.loc[~within_limit(seeds, name.removeprefix("cost_")), name]
-        excess = float((broken - limit).max())
-        share = excess / limit if limit > 0.0 else math.inf
-        if excess > 0.0 and share > largest:
-            largest, cost = share, named.get(name, "")
-            found = {"worst_excess": excess, "worst_share": share if limit > 0.0 else math.nan}
+    cost = ""
+    exceeded = worst_costs(seeds).dropna().sort_values(["worst_share", "worst_excess"], kind="stable")
+    if len(exceeded):
+        worst = exceeded.iloc[-1]
+        cost = named.get(f"cost_{worst['worst_cost']}", "")
+        share = worst["worst_share"] if math.isfinite(worst["worst_share"]) else math.nan
+        found = {"worst_excess": worst["worst_excess"], "worst_share": share}
     if len(limits) == 1:
         return found
     return (

@@ -45,6 +45,29 @@ def within_limit(rows: pd.DataFrame, i: str) -> pd.Series[bool]:
     return (rows[f"cost_{i}"] <= limit + tolerance(limit, errors)) | limit.isna()
 
 
+def worst_costs(rows: pd.DataFrame) -> pd.DataFrame:
+    """Find the cost of each row that is furthest above its limit, as a fraction of that limit.
+
+    Costs may have different units, so fractions are compared. Any excess of a limit of 0 is the largest.
+
+    Args:
+        rows: as for ``within_limit``, for every cost.
+
+    Returns:
+        worst_cost (its index, as text), worst_excess (cost minus limit) and worst_share (the same divided by
+        the limit; infinite at a limit of 0), with the index of ``rows``; NaN where no limit is exceeded by
+        more than its tolerance.
+    """
+    found = []
+    for i in costs_of(rows):
+        limit = rows[f"deploy_limit_{i}"]
+        excess = (rows[f"cost_{i}"] - limit).mask(within_limit(rows, i))
+        share = (excess / limit.where(limit > 0.0)).mask(excess.notna() & (limit <= 0.0), math.inf)
+        found.append(pd.DataFrame({"worst_cost": i, "worst_excess": excess, "worst_share": share}))
+    exceeded = pd.concat(found).dropna().sort_values(["worst_share", "worst_excess"], kind="stable")
+    return exceeded.groupby(level=0).last().reindex(rows.index)
+
+
 def tolerance(limits: pd.Series[float], errors: pd.Series[float]) -> pd.Series[float]:
     """Return the tolerance of a mean cost: COST_TOLERANCE of its limit, or a standard error if larger.
 

@@ -41,6 +41,7 @@ class FinalOutcome:
         costs: episode costs, likewise, [k].
         limits: d_d, [k].
         is_feasible: whether every cost is within its limit and the tolerance.
+        worst_cost: index of the cost that is furthest above its limit, as a fraction of it; None if feasible.
         is_solved: whether it is also near a known optimum.
         exact: whether the values were computed, not sampled.
         cpu_seconds: CPU time of the trial, which differs from that of an earlier run; None if not known.
@@ -54,6 +55,7 @@ class FinalOutcome:
     is_feasible: bool
     is_solved: bool
     exact: bool
+    worst_cost: int | None = None
     cpu_seconds: float | None = None
 
     @property
@@ -63,8 +65,15 @@ class FinalOutcome:
 
     @property
     def excess(self) -> float:
-        """Largest cost above its limit."""
-        return max((cost - limit for cost, limit in zip(self.costs, self.limits, strict=True)), default=0.0)
+        """How far ``worst_cost`` is above its limit; 0 if feasible."""
+        i = self.worst_cost
+        return 0.0 if i is None else self.costs[i] - self.limits[i]
+
+    @property
+    def relative_excess(self) -> float:
+        """The excess as a fraction of the limit, infinite at a limit of 0; 0 if feasible."""
+        limit = math.inf if self.worst_cost is None else self.limits[self.worst_cost]
+        return self.excess / limit if limit > 0.0 else math.inf
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -153,10 +162,9 @@ def trial_note(outcome: FinalOutcome, start_limits: Sequence[float]) -> str:
         start_limits: the d_t that its curriculum began with, [k].
     """
     how = "computed exactly" if outcome.exact else "means over sampled episodes"
-    by = f" by {_text(outcome.excess)}" if outcome.verdict == INFEASIBLE else ""
     costs = _listed(outcome.costs, digits=3)
     return (
-        f"**{outcome.verdict}{by}**: return {_text(outcome.episode_return)}, cost {costs}, "
+        f"**{outcome.verdict}{_by([outcome])}**: return {_text(outcome.episode_return)}, cost {costs}, "
         f"limit d_d {_listed(outcome.limits)}, training limit d_t {_listed(start_limits)}.\n\n"
         f"These are the metrics `final/...` of the final policy (stochastic, without learning), {how}, as in "
         "the report. `evaluation/...` are means over sampled episodes of the same policy. "
@@ -198,14 +206,21 @@ def _verdicts(seeds: Sequence[FinalOutcome], states: Sequence[TrialStatus]) -> s
         chosen = [it for it in seeds if it.verdict == verdict]
         if chosen:
             count = f" {len(chosen)} of {total}" if len(chosen) < total else ""
-            up_to = "up to " if len(chosen) > 1 else ""
-            by = f" by {up_to}{_text(max(it.excess for it in chosen))}" if verdict == INFEASIBLE else ""
-            parts.append(f"{verdict}{count}{by}")
+            parts.append(f"{verdict}{count}{_by(chosen)}")
     without = {FAILED: failed, PENDING: total - len(seeds) - failed}
     for name, number in without.items():
         if number > 0:
             parts.append(f"{name} {number} of {total}" if number < total else name)
     return ", ".join(parts)
+
+
+def _by(outcomes: Sequence[FinalOutcome]) -> str:
+    """Return the largest excess of infeasible policies, as in `` by up to 0.28``; of several costs, which."""
+    worst = max(outcomes, key=lambda it: (it.relative_excess, it.excess))
+    if worst.worst_cost is None:
+        return ""
+    cost = f", cost {worst.worst_cost}" if len(worst.costs) > 1 else ""
+    return f"{cost} by {'up to ' * (len(outcomes) > 1)}{_text(worst.excess)}"
 
 
 def _outcome(row: Mapping[str, str]) -> FinalOutcome:
@@ -220,6 +235,7 @@ def _outcome(row: Mapping[str, str]) -> FinalOutcome:
         is_feasible=row["feasible"] == "True",
         is_solved=row["optimal"] == "True",
         exact=row["exact"] == "True",
+        worst_cost=int(row["worst_cost"]) if row.get("worst_cost") else None,
         cpu_seconds=float(row["cpu_seconds"]) if row.get("cpu_seconds") else None,
     )
 

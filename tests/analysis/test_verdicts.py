@@ -362,3 +362,17 @@ def test_sampled_policies_are_said_to_be_sampled() -> None:
     sampled = judged([outcome("none", 0, 9.5, 5.0, exact=False, episodes=30)])
     assert "means over 30 episodes" in verdict_texts.explanation(sampled)[0]
     assert "computed exactly" in verdict_texts.explanation(judged(ROWS))[0]
+
+
+def test_a_task_without_a_cost_does_not_take_the_name_of_it_from_the_others() -> None:
+    two = {"task": "two", "cost_1": 1.0, "deploy_limit_1": 2.0}
+    one = {"task": "one", "cost_1": math.nan, "deploy_limit_1": math.nan}
+    rows = [outcome("none", 0, 9.5, 4.5, **two), outcome("none", 0, 9.5, 4.5, **one)]
+    trials = trials_of(rows)
+    flags = trials[list(KEY)].assign(no_curriculum=False, hard_landing=False)
+    table = count_verdicts(pd.DataFrame(rows), NONE_COMPARED, flags, trials, {"two": ("fuel", "time")})
+    assert table.set_index("task")[["cost_name_0", "cost_name_1"]].T.to_dict("list") == {
+        "two": ["fuel", "time"],
+        "one": ["0", ""],
+    }
+    assert {"cost 0", "cost time"} <= set(verdict_texts.verdict_table(table.assign(cost_1_se=0.0)))

@@ -34,7 +34,13 @@ from recrl.orchestrator.tracking import background_sync, client, mlflow_sync
 from recrl.orchestrator.tracking.background_sync import start_sync
 from recrl.orchestrator.tracking.chart_view import view_tag
 from recrl.orchestrator.tracking.client import sqlite_path, tracking_uri
-from recrl.orchestrator.tracking.final_outcomes import FinalOutcome, FinalOutcomes, _outcome, verdict_lines
+from recrl.orchestrator.tracking.final_outcomes import (
+    FinalOutcome,
+    FinalOutcomes,
+    _outcome,
+    trial_note,
+    verdict_lines,
+)
 from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.tracking.run_content import (
     Summary,
@@ -604,10 +610,10 @@ def write_outcomes(store: SweepStore, *, dynamic_cost: float = 9.0625) -> None:
     none, dynamic = (trial_titled(store, title).spec.trial_id for title in (NONE, DYNAMIC))
     store.figures_folder.mkdir(exist_ok=True)
     (store.figures_folder / "outcomes.csv").write_text(f"""\
-trial_id,task,agent,method,seed,measure,exact,episode_return,cost_0,deploy_limit_0,feasible,optimal
-{none},river-a,cpo,none,0,deployment,False,1.0,9.0,5.0,False,False
-{none},river-a,cpo,none,0,stochastic,True,14.0,5.0,5.0,True,True
-{dynamic},river-a,cpo,dynamic,0,stochastic,True,15.0,{dynamic_cost},5.0,False,False
+trial_id,task,agent,method,seed,measure,exact,episode_return,cost_0,deploy_limit_0,feasible,optimal,worst_cost
+{none},river-a,cpo,none,0,deployment,False,1.0,9.0,5.0,False,False,0
+{none},river-a,cpo,none,0,stochastic,True,14.0,5.0,5.0,True,True,
+{dynamic},river-a,cpo,dynamic,0,stochastic,True,15.0,{dynamic_cost},5.0,False,False,0
 """)
 
 
@@ -775,6 +781,16 @@ def test_sync_rebuilds_what_mlflow_shows(
     assert after.keys() == before.keys()
     assert rebuilt.info.run_id != sent.info.run_id
     assert rebuilt.data.metrics == sent.data.metrics
+
+
+def test_of_several_costs_the_verdict_names_the_one_of_the_report() -> None:
+    """The cost that is furthest above its limit as a fraction; cost 1 may be within its tolerance."""
+    group = ("map", "cpo", "none")
+    near = FinalOutcome("a", group, 4.0, (5.5, 1050.0), (5.0, 1000.0), False, False, False, worst_cost=0)
+    zero = replace(near, costs=(5.5, 0.25), limits=(5.0, 0.0), worst_cost=1)
+    assert trial_note(near, (9.0, 9.0)).startswith("**infeasible, cost 0 by 0.50**: ")
+    assert trial_note(zero, (9.0, 9.0)).startswith("**infeasible, cost 1 by 0.25**: ")
+    assert "infeasible, cost 1 by up to 0.25 |" in verdict_lines([near, zero], {group: []})[2]
 
 
 def test_failed_trials_are_in_the_table_of_verdicts() -> None:

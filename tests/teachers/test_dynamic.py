@@ -796,7 +796,7 @@ def test_the_remaining_steps_allow_for_an_episode_before_each_window() -> None:
 
 @pytest.mark.parametrize("options", [{"window": 5}, {"window": 20, "window_unit": "episodes"}])
 def test_the_remaining_episodes_are_those_to_come_though_some_do_not_count(options: dict[str, Any]) -> None:
-    """64 environments of 64 steps an update, 1,000 steps an episode: 4 end per update, at the limit's cost."""
+    """64 environments of 64 steps an update, 1,000 steps an episode: 4 end per update, each at the limit."""
     budget = 1_900_000
     teacher = teacher_of(budget, remaining="episodes", overlapping_episodes="ignore", **options)
     step, state = teacher.start()
