@@ -262,7 +262,7 @@ def test_a_policy_is_loaded_by_its_row_in_trials(
         recrl.load_policy("one.zip", trial_id)
     with pytest.raises(recrl.RecrlError, match="one: has no trial '3f2a'; "):
         recrl.load_policy(training.sweep, "3f2a")
-    sentence = "^source: must be a sweep, .* got {}; of a training use training.policy or training.sweep$"
+    sentence = "^source: must be a sweep, .* got {}; a training has its policy already, training.policy$"
     with pytest.raises(recrl.RecrlError, match=sentence.format("Training")):
         recrl.load_policy(training)  # type: ignore[arg-type]
     with pytest.raises(recrl.RecrlError, match=sentence.format("NoneType")):
