@@ -1,0 +1,80 @@
+"""Solved trials of RiverGrid by curriculum, and the pairs of equal seeds that only one of two solves.
+
+    python -m tests.benchmarks.solved_pairs results/rivergrid/today.csv --compare dynamic none
+
+The tables are those of ``average_or_last.py``. Solved: a cost at most 1% above the limit, and a return within
+0.2 of the optimum. p is that of McNemar's exact test, which takes the pairs as independent.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pandas as pd
+from scipy.stats import binomtest
+
+from recrl.analysis.statistics.verdicts import solved
+from recrl.environments.cmdp import CostLimits
+from recrl.environments.registry import optimal_return
+
+PAIR = ["task", "agent", "seed"]
+
+
+def judged(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows with a column ``solved``.
+
+    Args:
+        rows: task, limit, return and cost of exactly evaluated policies.
+    """
+    optima = {
+        (task, limit): optimal_return(str(task), {}, CostLimits((float(limit),)))
+        for task, limit in rows[["task", "limit"]].drop_duplicates().itertuples(index=False)
+    }
+    optimum = pd.Series([optima[key] for key in zip(rows["task"], rows["limit"], strict=True)], rows.index)
+    measured = pd.DataFrame(
+        {"gap": optimum - rows["return"], "cost_0": rows["cost"], "deploy_limit_0": rows["limit"]}
+    )
+    return rows.assign(solved=solved(measured))
+
+
+def lines(rows: pd.DataFrame, first: str, second: str) -> Iterator[str]:
+    """Yield the counts of one kind of policy.
+
+    Args:
+        rows: of ``judged``.
+        first: a curriculum.
+        second: another one, with the same seeds.
+    """
+    by_group = rows.groupby(["method", "task", "agent"])["solved"]
+    yield by_group.agg(["sum", "count"]).unstack(["task", "agent"])["sum"].to_string()
+    wide = rows.pivot(index=PAIR, columns="method", values="solved").loc[:, [first, second]].dropna()
+    only = pd.DataFrame(
+        {
+            each: wide[each].astype(bool) & ~wide[other].astype(bool)
+            for each, other in ((first, second), (second, first))
+        }
+    )
+    yield f"pairs that only one solves, of {len(wide)}:"
+    yield only.groupby(["task", "agent"]).sum().to_string()
+    ones, others = (int(only[each].sum()) for each in (first, second))
+    p = binomtest(ones, ones + others).pvalue if ones + others else 1.0
+    yield f"together: {first} {ones}, {second} {others}, exact p {p:.4f}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the counts of the averaged policies, then those of the last ones."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("tables", nargs="+", type=Path, metavar="TABLE")
+    parser.add_argument("--compare", nargs=2, default=["dynamic", "none"], metavar="CURRICULUM")
+    given = parser.parse_args(arguments)
+    rows = judged(pd.concat([pd.read_csv(table) for table in given.tables], ignore_index=True))
+    for policy in ("average", "last"):
+        chosen = rows[rows["policy"] == policy]
+        print(f"\n{policy}: {int(chosen['solved'].sum())} of {len(chosen)} solved")
+        print("\n".join(lines(chosen, *given.compare)))
+
+
+if __name__ == "__main__":
+    main()
