@@ -284,6 +284,6 @@ def _planned_action(record: TrialRecord, selection: TrialSelection) -> PlannedAc
 
 
 def kind_of(spec: TrialSpec) -> str:
-    """Return the key of trials with about equal speed: task, agent and number of environments."""
+    """Return the key of trials with about equal speed: task, agent, environments and steps of a rollout."""
     kind: tuple[Choice | int, ...] = (spec.task, spec.agent, spec.num_envs, spec.rollout_steps)
     return repr(kind)

@@ -11,10 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from recrl.agents.shared_options import (
-    STARTER_AGENTS_ASCENT,
     STARTER_AGENTS_MULTIPLIERS,
-    STARTER_AGENTS_SETTING,
-    STARTER_AGENTS_TRUST_REGION,
     AscentConfig,
     LagrangianConfig,
     NonNegative,
@@ -42,8 +39,7 @@ class PPOLagConfig(LagrangianConfig, AscentConfig):
     """Settings of ``ppo-lag``, PPO on the Lagrangian."""
 
     paper: ClassVar[Mapping[str, Any]] = {
-        **STARTER_AGENTS_SETTING,
-        **STARTER_AGENTS_ASCENT,
+        **AscentConfig.paper,
         **STARTER_AGENTS_MULTIPLIERS,
         "penalty": "separate",
     }
@@ -95,8 +91,7 @@ class IPOConfig(AscentConfig):
     """Settings of ``ipo``, interior-point policy optimisation."""
 
     paper: ClassVar[Mapping[str, Any]] = {
-        **STARTER_AGENTS_SETTING,
-        **STARTER_AGENTS_ASCENT,
+        **AscentConfig.paper,
         "barrier_sharpness": 20.0,
         "cost_surrogate": "plain",
     }
@@ -153,8 +148,7 @@ class TRPOLagConfig(LagrangianConfig, TrustRegionConfig):
     """Settings of ``trpo-lag``, TRPO on the Lagrangian."""
 
     paper: ClassVar[Mapping[str, Any]] = {
-        **STARTER_AGENTS_SETTING,
-        **STARTER_AGENTS_TRUST_REGION,
+        **TrustRegionConfig.paper,
         **STARTER_AGENTS_MULTIPLIERS,
         "kl_penalty": 0.0,
     }
@@ -171,8 +165,7 @@ class CRPOConfig(TrustRegionConfig):
     """Settings of ``crpo``, constraint-rectified policy optimisation."""
 
     paper: ClassVar[Mapping[str, Any]] = {
-        **STARTER_AGENTS_SETTING,
-        **STARTER_AGENTS_TRUST_REGION,
+        **TrustRegionConfig.paper,
         "kl_penalty": 0.0,
         "tolerance": 0.5,
     }

@@ -55,17 +55,10 @@ def value_at_risk(costs: Floats, level: float) -> Floats:
     return quantile
 
 
-def conditional_value_at_risk(costs: Floats, level: float) -> Floats:
-    """Return the mean of the worst fraction 1 - alpha of E costs, [E, k] -> [k].
-
-    >>> conditional_value_at_risk(np.array([[4.0], [1.0], [3.0], [2.0]]), 0.5)
-    array([3.5])
-    """
-    return tail_bound(costs, value_at_risk(costs, level), level)
-
-
 def tail_bound(costs: Floats, threshold: Floats, level: float) -> Floats:
     """Return nu + mean(max(C - nu, 0)) / (1 - alpha), an upper bound on the CVaR, [E, k] -> [k].
+
+    It is the CVaR, the mean of the worst fraction 1 - alpha, where nu is the ``value_at_risk``.
 
     >>> tail_bound(np.array([[4.0], [1.0], [3.0], [2.0]]), np.array([2.5]), 0.5)
     array([3.5])

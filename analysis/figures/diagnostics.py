@@ -23,11 +23,11 @@ from recrl.analysis.data.cost_names import cost_suffix
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import IN_FORCE_COLOUR, LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
-from recrl.analysis.statistics.curves import mean_curve, step_grid
+from recrl.analysis.statistics.curves import Extent, mean_curve
 from recrl.environments.cmdp import Floats
+from recrl.orchestrator.files.trial_warnings import POLICY_NOISE
 
 BINS = 100
-NOISE_EVENT = "policy noise"
 RECOVERY_CASE = 2.0  # CPO's ``case`` of a step that only decreases the cost
 LARGE_MULTIPLIER = 50.0
 EVENT_HEIGHT = 0.04  # of the events' marks, as a fraction of the panel's height
@@ -57,9 +57,8 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
     trials, updates, events = (
         panels.rows_of(frame, task, agent) for frame in (sweep.trials, sweep.updates, sweep.events)
     )
-    boundary, total = int(trials["boundary_step"].min()), int(trials["total_steps"].max())
-    count = int(total // trials["steps_per_update"].min())
-    edges = step_grid(boundary, total, updates=count, bins=BINS)
+    extent = Extent.of(trials)
+    edges = extent.grid(BINS)
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
     methods = [method for method in look if (updates["method"] == method).any()]
     quantities = (
@@ -80,7 +79,7 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
             by_quantity = dict(zip(rows, column, strict=True))
             for quantity, axes in by_quantity.items():
                 _panel(axes, chosen, quantity, edges, look[method])
-                panels.phase_boundary(axes, boundary, total)
+                panels.phase_boundary(axes, extent.boundary, extent.total)
             _limits(column[0], chosen, f"limit_{cost}")
             noise = events.loc[_is_noise(events, method), "end_step"]
             _event_marks(column[0], noise, look[method], NOISE_MARK)
@@ -88,7 +87,7 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
             if "kl" in by_quantity:
                 _divergence_marks(by_quantity["kl"], chosen, look[method], target)
             column[0].set_title(method)
-            panels.step_axis(column[-1], 0.0, total)
+            panels.step_axis(column[-1], 0.0, extent.total)
             column[-1].set_xlabel("environment steps")
         largest = updates[f"cost_{cost}"].fillna(0.0).max()  # 0 before the first episode has finished
         scale = _scale_costs(grid[0], limit, float(largest))
@@ -203,7 +202,7 @@ def _legend(figure: Figure, title: str, seeds: int, target: float | None) -> Non
 
 
 def _is_noise(events: pd.DataFrame, method: str) -> pd.Series[bool]:
-    return (events["method"] == method) & (events["event"] == NOISE_EVENT)
+    return (events["method"] == method) & (events["event"] == POLICY_NOISE)
 
 
 def _known(updates: pd.DataFrame, quantity: str) -> bool:

@@ -28,7 +28,7 @@ WARNINGS = {
     ),
     "hard_landing": (
         "hard landing",
-        "Hard landing: more than 10% of the way from d_t to d_d was left when deployment began.",
+        "Hard landing: more than 10% of the way from d_t to d_d, and of d_d, was left when deployment began.",
     ),
 }
 ONE_SEED = "One seed (n = 1): no intervals, and another seed may give another verdict."
@@ -258,8 +258,7 @@ def verdict_text(row: pd.Series) -> str:
     planned = int(row["planned"])
     share = "" if math.isnan(row["worst_share"]) else f" ({_percent(row['worst_share'])})"
     excess = f"{_small(row['worst_excess'])}{share}"
-    cost = row.get("worst_cost", "")
-    cost = f"cost {cost}" if cost.isdigit() else cost
+    cost = _cost(row.get("worst_cost", ""))
     counts = {
         SOLVED: int(row["solved"]),
         FEASIBLE: int(row["feasible"] - row["solved"]),
@@ -431,7 +430,7 @@ def _violations(rows: pd.DataFrame, column: str) -> list[str]:
         total = int(chosen["seeds"].sum())
         verb = "exceed" if len(always) > 1 and who != "every curriculum" else "exceeds"
         what = "policy" if total == 1 else "policies"
-        parts.append(f"{who} {verb} {limit} by {_excess(chosen)} ({total} of {total} {what})")
+        parts.append(f"{who} {verb} {_exceeded(chosen, limit)} ({total} of {total} {what})")
         limit = "it" if limit != SOME_LIMIT else limit
     for method, count in sometimes.iterrows():
         chosen = rows[(rows["method"] == method) & (rows["infeasible"] > 0)]
@@ -439,7 +438,7 @@ def _violations(rows: pd.DataFrame, column: str) -> list[str]:
         bad, total = int(count["infeasible"]), int(count["ended"])
         others = "the other exceeds" if total == 2 and count[column] else f"{bad} exceed{'s' * (bad == 1)}"
         parts.append(
-            f"{str(method)!r} {done} {int(count[column])} of {total}, {others} {limit} by {_excess(chosen)}"
+            f"{str(method)!r} {done} {int(count[column])} of {total}, {others} {_exceeded(chosen, limit)}"
         )
         limit = "it" if limit != SOME_LIMIT else limit
     return parts
@@ -447,9 +446,21 @@ def _violations(rows: pd.DataFrame, column: str) -> list[str]:
 
 def _limit_text(rows: pd.DataFrame) -> str:
     """Name the limit of a task, or say ``a limit`` if it has several costs."""
-    names = [str(name) for name in rows if str(name).startswith("deploy_limit_")]
-    limits = {float(value) for name in names for value in rows[name].dropna()}
-    return f"the limit of {limits.pop():g}" if len(limits) == 1 else SOME_LIMIT
+    limits = rows.filter(regex="^deploy_limit_").dropna(axis=1, how="all").iloc[0].astype(float).tolist()
+    return f"the limit of {limits[0]:g}" if len(limits) == 1 else SOME_LIMIT
+
+
+def _exceeded(rows: pd.DataFrame, limit: str) -> str:
+    """Say which limit infeasible policies exceed, and by how much; with several costs, name each."""
+    if limit != SOME_LIMIT:
+        return f"{limit} by {_excess(rows)}"
+    costs = [f"{_cost(str(cost))} by {_excess(of_cost)}" for cost, of_cost in rows.groupby("worst_cost")]
+    return f"{limit}: {_listed(costs)}"
+
+
+def _cost(name: str) -> str:
+    """Return a cost's name, or ``cost 1`` where only its number is known."""
+    return f"cost {name}" if name.isdigit() else name
 
 
 def _excess(rows: pd.DataFrame) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -82,6 +83,31 @@ def step_grid(boundary_step: int, total_steps: int, *, updates: int, bins: int) 
     deployment = min(max(1, round(count * (1.0 - boundary_step / total_steps))), count - 1)
     training = np.linspace(0.0, boundary_step, count - deployment + 1)
     return np.concatenate([training, np.linspace(boundary_step, total_steps, deployment + 1)[1:]])
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Steps and updates that trials have in common in a figure.
+
+    Attributes:
+        boundary: first environment step under d_d, of the trial that comes to it first.
+        total: environment steps of the longest trial.
+        updates: policy updates in ``total``, if they are as short as the shortest.
+    """
+
+    boundary: int
+    total: int
+    updates: int
+
+    @classmethod
+    def of(cls, trials: pd.DataFrame) -> Self:
+        """Return the extent of trials of one task and agent; rows of ``Sweep.trials``."""
+        total = int(trials["total_steps"].max())
+        return cls(int(trials["boundary_step"].min()), total, int(total // trials["steps_per_update"].min()))
+
+    def grid(self, bins: int) -> Floats:
+        """Return the ``step_grid`` with at most ``bins`` bins."""
+        return step_grid(self.boundary, self.total, updates=self.updates, bins=bins)
 
 
 def binned_runs(updates: pd.DataFrame, column: str, edges: Floats) -> Floats:

@@ -60,7 +60,7 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
         cost_i, cost_i_se (standard errors over the trial's episodes, 0 where exact), trial_id, cpu_seconds
         (of the trial: MLflow tells its outcome from that of an earlier run), deploy_limit_i, optimal_return,
         gap (J*(d_d) minus the return; the regret of a feasible trial), feasible, optimal (solved; False where
-        J* is not known), worst_cost and worst_excess (of ``worst_costs``; NaN where feasible).
+        J* is not known), worst_cost, worst_excess and worst_share (of ``worst_costs``).
     """
     costs = [f"cost_{i}" for i in range(sweep.num_costs)]
     final = _with_exact(_frozen(sweep, costs), sweep.exact)
@@ -73,7 +73,7 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
     rows["gap"] = rows["optimal_return"] - rows["episode_return"]
     rows["feasible"] = within_limits(rows)
     rows["optimal"] = solved(rows)
-    rows[["worst_cost", "worst_excess"]] = worst_costs(rows)[["worst_cost", "worst_excess"]]
+    rows = rows.join(worst_costs(rows))
     order = {measure.value: position for position, measure in enumerate(Measure)}
     by_measure = rows["measure"].map(order).rename("_order")
     rows = rows.assign(_order=by_measure).sort_values([*KEY, "_order"], kind="stable", ignore_index=True)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from recrl.orchestrator.spec import TrialSpec
 
-HARD_LANDING = "hard landing"  # the event
+HARD_LANDING, POLICY_NOISE = "hard landing", "policy noise"  # events
 CONTROLS = ("step", "unconstrained")  # curricula that keep d_t until deployment, as they should
 NAMED = 5  # trials in a sentence, at most
 

@@ -41,7 +41,13 @@ from recrl.teachers.registry import TEACHERS
 
 OURS = "recrl"
 FOLDERS = ("agents", "environments", "teachers")  # top-level parts that affect results
-MODULES = ("trial/trial.py", "trial/attempt.py", "spec.py")  # of the orchestrator
+MODULES = (  # of the orchestrator
+    "trial/trial.py",
+    "trial/attempt.py",
+    "trial/device.py",
+    "trial/one_thread.py",
+    "spec.py",
+)
 SUFFIXES = (".py", ".xml", ".txt")
 MOST_FILES = 1000  # of the user's project, for one plug-in
 PROJECT_FILES = ("pyproject.toml", "setup.py", "setup.cfg", ".git")  # in the folder of a project

@@ -42,6 +42,8 @@ class FinalOutcome:
         limits: d_d, [k].
         is_feasible: whether every cost is within its limit and the tolerance.
         worst_cost: index of the cost that is furthest above its limit, as a fraction of it; None if feasible.
+        worst_excess: how far it is above its limit.
+        worst_share: the same divided by the limit; infinite at a limit of 0.
         is_solved: whether it is also near a known optimum.
         exact: whether the values were computed, not sampled.
         cpu_seconds: CPU time of the trial, which differs from that of an earlier run; None if not known.
@@ -56,24 +58,14 @@ class FinalOutcome:
     is_solved: bool
     exact: bool
     worst_cost: int | None = None
+    worst_excess: float = 0.0
+    worst_share: float = 0.0
     cpu_seconds: float | None = None
 
     @property
     def verdict(self) -> str:
         """The verdict in one word, as in the report."""
         return SOLVED if self.is_solved else FEASIBLE if self.is_feasible else INFEASIBLE
-
-    @property
-    def excess(self) -> float:
-        """How far ``worst_cost`` is above its limit; 0 if feasible."""
-        i = self.worst_cost
-        return 0.0 if i is None else self.costs[i] - self.limits[i]
-
-    @property
-    def relative_excess(self) -> float:
-        """The excess as a fraction of the limit, infinite at a limit of 0; 0 if feasible."""
-        limit = math.inf if self.worst_cost is None else self.limits[self.worst_cost]
-        return self.excess / limit if limit > 0.0 else math.inf
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -216,11 +208,11 @@ def _verdicts(seeds: Sequence[FinalOutcome], states: Sequence[TrialStatus]) -> s
 
 def _by(outcomes: Sequence[FinalOutcome]) -> str:
     """Return the largest excess of infeasible policies, as in `` by up to 0.28``; of several costs, which."""
-    worst = max(outcomes, key=lambda it: (it.relative_excess, it.excess))
+    worst = max(outcomes, key=lambda it: (it.worst_share, it.worst_excess))
     if worst.worst_cost is None:
         return ""
     cost = f", cost {worst.worst_cost}" if len(worst.costs) > 1 else ""
-    return f"{cost} by {'up to ' * (len(outcomes) > 1)}{_text(worst.excess)}"
+    return f"{cost} by {'up to ' * (len(outcomes) > 1)}{_text(worst.worst_excess)}"
 
 
 def _outcome(row: Mapping[str, str]) -> FinalOutcome:
@@ -235,7 +227,9 @@ def _outcome(row: Mapping[str, str]) -> FinalOutcome:
         is_feasible=row["feasible"] == "True",
         is_solved=row["optimal"] == "True",
         exact=row["exact"] == "True",
-        worst_cost=int(row["worst_cost"]) if row.get("worst_cost") else None,
+        worst_cost=int(row["worst_cost"]) if row["worst_cost"] else None,
+        worst_excess=float(row["worst_excess"] or 0.0),
+        worst_share=float(row["worst_share"] or 0.0),
         cpu_seconds=float(row["cpu_seconds"]) if row.get("cpu_seconds") else None,
     )
 

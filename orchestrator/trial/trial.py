@@ -17,7 +17,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -32,7 +32,7 @@ from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector
 from recrl.environments.vector import CMDPVectorEnv
 from recrl.orchestrator.errors import USERS_ERRORS, described
-from recrl.orchestrator.files.trial_warnings import HARD_LANDING
+from recrl.orchestrator.files.trial_warnings import HARD_LANDING, POLICY_NOISE
 from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.agent_answers import checked_metrics, checked_noise
@@ -94,16 +94,22 @@ class Trial:
         seeds = TrialSeeds.of(spec)
         self._evaluation_seed = seeds.evaluation
         self._generator = np.random.default_rng(seeds.exploration)
-        self._environments = make_vector(spec.task.name, spec.num_envs, options=spec.task.options)
-        self._cmdp = self._environments.cmdp
-        self._agent: Agent = make_agent(spec.agent.name, self._cmdp, spec.agent.options, seeds.agent)
-        self._collector = Collector(self._environments, num_steps=spec.rollout_steps, staggered=True)
-        tree = writer.restore()
+        with ExitStack() as on_error:
+            self._environments = make_vector(spec.task.name, spec.num_envs, options=spec.task.options)
+            on_error.callback(self.close)
+            self._cmdp = self._environments.cmdp
+            self._agent: Agent = make_agent(spec.agent.name, self._cmdp, spec.agent.options, seeds.agent)
+            self._collector = Collector(self._environments, num_steps=spec.rollout_steps, staggered=True)
+            self._start_or_continue(seeds)
+            on_error.pop_all()
+
+    def _start_or_continue(self, seeds: TrialSeeds) -> None:
+        tree = self._writer.restore()
         if tree is None:
             self._collector.reset(seed=int(seeds.environment.generate_state(1)[0]))
             self.update = self.env_steps = self._episodes = 0
-            self._step, self._teacher_state = self._checked(teacher.start(), before=None)
-            logger.info("started: %s", spec.title)
+            self._step, self._teacher_state = self._checked(self._teacher.start(), before=None)
+            logger.info("started: %s", self.spec.title)
         else:
             self._load(tree)
             logger.info("resumed after update %d, %d environment steps", self.update, self.env_steps)
@@ -227,7 +233,7 @@ class Trial:
         if self._step.policy_noise > 0.0:
             flat = observations.reshape(-1, observations.shape[-1])
             done = checked_noise(self.spec.agent.label, self._agent.add_noise(self._step.policy_noise, flat))
-            self._event("policy noise", policy_noise=self._step.policy_noise, **done)
+            self._event(POLICY_NOISE, policy_noise=self._step.policy_noise, **done)
         if self._step.rewards_entropy and not isinstance(self._agent, EntropyRewarded):
             raise TypeError(
                 f"method {self.spec.method.name} rewards entropy, which agent {self.spec.agent.name} does "

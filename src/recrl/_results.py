@@ -123,8 +123,8 @@ def _folder_of(sweep: Sweep, trial_id: str | None) -> Path:
 
     if not isinstance(sweep, Sweep):
         raise RecrlError(
-            f"source: must be a sweep, a folder or a name, got {type(sweep).__name__}; a training has its policy "
-            "already, training.policy"
+            f"source: must be a sweep, a folder or a name, got {type(sweep).__name__}; a training has its "
+            "policy already, training.policy"
         )
     if sweep.folder is None:
         raise RecrlError(f"{sweep.name}: {NO_POLICIES}")

@@ -18,7 +18,7 @@ from recrl.agents.constraints.cost_measures import (
     MeanCost,
     RecentEpisodes,
     TailCost,
-    conditional_value_at_risk,
+    tail_bound,
     tail_costs,
     value_at_risk,
 )
@@ -28,6 +28,10 @@ from recrl.environments.cmdp import CostLimits, CurriculumStep, Floats
 from recrl.environments.registry import make_vector
 
 NUM_ENVS = 64
+
+
+def conditional_value_at_risk(costs: Floats, level: float) -> Floats:
+    return tail_bound(costs, value_at_risk(costs, level), level)
 
 
 def column(*values: float) -> Floats:

@@ -14,11 +14,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from PIL import Image
 
+from recrl.agents.trust_region.cpo_dual import StepCase
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.labels import METHOD_ORDER
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import learning_curves, styles
-from recrl.analysis.figures.diagnostics import curriculum_diagnostics
+from recrl.analysis.figures.diagnostics import RECOVERY_CASE, curriculum_diagnostics
 from recrl.analysis.figures.frontier import concave_frontier, return_against_cost
 from recrl.analysis.figures.styles import IN_FORCE_COLOUR, LIMIT_COLOUR, OPTIMUM_COLOUR, STYLES
 from recrl.analysis.report.figure_list import drawings
@@ -379,3 +380,7 @@ def test_the_users_matplotlib_is_left_alone_and_leaves_ours_alone(panel: Sweep, 
     with mpl.rc_context({"axes.facecolor": "red", "font.size": 30.0}):
         other = styles.save_png(learning_curves.curricula(panel), tmp_path / "other.png")
     assert other.read_bytes() == usual
+
+
+def test_the_figure_marks_the_case_of_the_trust_region_agents() -> None:
+    assert RECOVERY_CASE == StepCase.RECOVERY

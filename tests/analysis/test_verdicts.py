@@ -376,3 +376,17 @@ def test_a_task_without_a_cost_does_not_take_the_name_of_it_from_the_others() ->
         "one": ["0", ""],
     }
     assert {"cost 0", "cost time"} <= set(verdict_texts.verdict_table(table.assign(cost_1_se=0.0)))
+
+
+def test_the_first_sentences_name_each_cost_that_exceeds_its_limit() -> None:
+    """Costs may have different units, although their limits are equal."""
+    limits = {"deploy_limit_0": 25.0, "deploy_limit_1": 25.0, "optimal_return": math.nan, "feasible": False}
+    rows = [
+        outcome("none", 0, 9.5, 325.0, cost_1=25.0, **limits),
+        outcome("linear", 0, 9.5, 25.0, cost_1=27.5, **limits),
+    ]
+    trials = trials_of(rows)
+    flags = trials[list(KEY)].assign(no_curriculum=False, hard_landing=False)
+    table = count_verdicts(pd.DataFrame(rows), NONE_COMPARED, flags, trials, {"river": ("fuel", "wear")})
+    sentence = verdict_texts.answers(table)[-1]
+    assert "every curriculum exceeds a limit: fuel by 300.0 and wear by 2.50 (2 of 2 policies)" in sentence

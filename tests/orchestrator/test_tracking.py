@@ -69,6 +69,7 @@ def test_twelve_costs_are_in_their_order() -> None:
     costs = {f"cost_{i}": str(float(i)) for i in range(12)}
     limits = {f"deploy_limit_{i}": str(100.0 + i) for i in range(12)}
     verdict = {"feasible": "True", "optimal": "False", "exact": "False", "episode_return": "1"}
+    verdict |= dict.fromkeys(("worst_cost", "worst_excess", "worst_share"), "")
     outcome = _outcome(
         {"trial_id": "x", "task": "t", "agent": "a", "method": "m", **costs, **limits, **verdict}
     )
@@ -610,10 +611,10 @@ def write_outcomes(store: SweepStore, *, dynamic_cost: float = 9.0625) -> None:
     none, dynamic = (trial_titled(store, title).spec.trial_id for title in (NONE, DYNAMIC))
     store.figures_folder.mkdir(exist_ok=True)
     (store.figures_folder / "outcomes.csv").write_text(f"""\
-trial_id,task,agent,method,seed,measure,exact,episode_return,cost_0,deploy_limit_0,feasible,optimal,worst_cost
-{none},river-a,cpo,none,0,deployment,False,1.0,9.0,5.0,False,False,0
-{none},river-a,cpo,none,0,stochastic,True,14.0,5.0,5.0,True,True,
-{dynamic},river-a,cpo,dynamic,0,stochastic,True,15.0,{dynamic_cost},5.0,False,False,0
+trial_id,task,agent,method,seed,measure,exact,episode_return,cost_0,deploy_limit_0,feasible,optimal,worst_cost,worst_excess,worst_share
+{none},river-a,cpo,none,0,deployment,False,1.0,9.0,5.0,False,False,0,4.0,0.8
+{none},river-a,cpo,none,0,stochastic,True,14.0,5.0,5.0,True,True,,,
+{dynamic},river-a,cpo,dynamic,0,stochastic,True,15.0,{dynamic_cost},5.0,False,False,0,{dynamic_cost - 5.0},0.8
 """)
 
 
@@ -786,8 +787,9 @@ def test_sync_rebuilds_what_mlflow_shows(
 def test_of_several_costs_the_verdict_names_the_one_of_the_report() -> None:
     """The cost that is furthest above its limit as a fraction; cost 1 may be within its tolerance."""
     group = ("map", "cpo", "none")
-    near = FinalOutcome("a", group, 4.0, (5.5, 1050.0), (5.0, 1000.0), False, False, False, worst_cost=0)
-    zero = replace(near, costs=(5.5, 0.25), limits=(5.0, 0.0), worst_cost=1)
+    none = FinalOutcome("a", group, 4.0, (5.5, 1050.0), (5.0, 1000.0), False, False, False)
+    near = replace(none, worst_cost=0, worst_excess=0.5, worst_share=0.1)
+    zero = replace(none, worst_cost=1, worst_excess=0.25, worst_share=math.inf)
     assert trial_note(near, (9.0, 9.0)).startswith("**infeasible, cost 0 by 0.50**: ")
     assert trial_note(zero, (9.0, 9.0)).startswith("**infeasible, cost 1 by 0.25**: ")
     assert "infeasible, cost 1 by up to 0.25 |" in verdict_lines([near, zero], {group: []})[2]

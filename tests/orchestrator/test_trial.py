@@ -11,6 +11,7 @@ from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pandas as pd
@@ -411,6 +412,17 @@ def test_environments_are_closed_and_an_error_of_that_fails_nothing(
     store = SweepStore(tmp_path, "small").trial(SPEC)
     assert run_recorded(SPEC, store, should_stop=lambda: False) is TrialStatus.COMPLETE
     assert len(closed) == 3  # of the training, and of two evaluations
+
+
+def test_environments_are_closed_if_the_agent_cannot_be_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = []
+    monkeypatch.setattr(FiniteVectorEnv, "close_extras", lambda self, **_: closed.append(self))
+    monkeypatch.setattr("recrl.orchestrator.trial.trial.make_agent", Mock(side_effect=MemoryError))
+    with pytest.raises(MemoryError):
+        run_recorded(SPEC, SweepStore(tmp_path, "small").trial(SPEC), should_stop=lambda: False)
+    assert len(closed) == 1
 
 
 @pytest.mark.parametrize(("episodes", "environments"), [(3, 3), (4, 4), (6, 4)])
