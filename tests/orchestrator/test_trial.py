@@ -419,9 +419,9 @@ def test_environments_are_closed_if_the_agent_cannot_be_made(
 ) -> None:
     closed = []
     monkeypatch.setattr(FiniteVectorEnv, "close_extras", lambda self, **_: closed.append(self))
-    monkeypatch.setattr("recrl.orchestrator.trial.trial.make_agent", Mock(side_effect=MemoryError))
-    with pytest.raises(MemoryError):
-        run_recorded(SPEC, SweepStore(tmp_path, "small").trial(SPEC), should_stop=lambda: False)
+    monkeypatch.setattr(trial, "make_agent", Mock(side_effect=ValueError("no agent")))
+    store = SweepStore(tmp_path, "small").trial(SPEC)
+    assert run_recorded(SPEC, store, should_stop=never) is TrialStatus.FAILED
     assert len(closed) == 1
 
 
