@@ -13,10 +13,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recrl.agents.constraints.cost_measures import MeasuredCosts
-from recrl.agents.learning.distributions import Distribution
-from recrl.agents.learning.learning_batch import LearningBatch
-from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.building_blocks.distributions import Distribution
+from recrl.agents.building_blocks.learning_batch import LearningBatch
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.environments.cmdp import Floats
 
 
@@ -36,12 +35,6 @@ class Constraints:
     gaps: Floats
     standard_errors: Floats
     episode_length: float
-
-    @classmethod
-    def of(cls, measured: MeasuredCosts, limits: Floats) -> Constraints:
-        """Compare the constrained values with the limits, [k]."""
-        gaps = np.where(np.isfinite(limits), measured.values - limits, -np.inf)
-        return cls(limits, gaps, measured.standard_errors, measured.episode_length)
 
     @property
     def known(self) -> bool:

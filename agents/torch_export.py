@@ -6,7 +6,7 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor, nn
 
-from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.observation_features import CLIP, Encoder
 from recrl.agents.spaces import action_range
 

@@ -21,11 +21,11 @@ from collections.abc import Callable
 import numpy as np
 
 from recrl.agents.algorithms.own_options import CPOConfig, PCPOConfig
+from recrl.agents.building_blocks.advantages import standardised_advantages
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.constraints.violation_integral import ViolationIntegral
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.advantages import standardised_advantages
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful, indexed
 from recrl.agents.trust_region.cpo_dual import DualSolution, StepCase, StepProblem, solve_dual
 from recrl.agents.trust_region.line_search import line_search

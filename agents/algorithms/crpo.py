@@ -34,10 +34,10 @@ from __future__ import annotations
 import numpy as np
 
 from recrl.agents.algorithms.own_options import CRPOConfig
+from recrl.agents.building_blocks.advantages import standardised_advantages
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.advantages import standardised_advantages
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful, indexed
 from recrl.agents.trust_region.cpo_dual import (
     NO_INFLUENCE,

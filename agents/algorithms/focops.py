@@ -26,12 +26,12 @@ import torch
 from torch import Tensor
 
 from recrl.agents.algorithms.own_options import FOCOPSConfig
+from recrl.agents.building_blocks.distributions import Distribution
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.distributions import Distribution
 from recrl.agents.learning.gradient_ascent import Objective, RadiusRule
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import indexed
 from recrl.environments.cmdp import CMDPSpec, Floats
 

@@ -33,6 +33,14 @@ import torch
 from torch import Tensor
 
 from recrl.agents.algorithms.own_options import IPOConfig
+from recrl.agents.building_blocks.learning_batch import LearningBatch, to_tensor
+from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.surrogates import (
+    SignedAdvantages,
+    clipped_surrogate,
+    pessimistic_relief,
+    surrogate,
+)
 from recrl.agents.constraints.relative_units import RelativeConstraints, RelativeUnits
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
@@ -41,15 +49,7 @@ from recrl.agents.learning.gradient_ascent import (
     Objective,
     normalised_by_penalties,
 )
-from recrl.agents.learning.learning_batch import LearningBatch, to_tensor
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import indexed, no_steps
-from recrl.agents.learning.surrogates import (
-    SignedAdvantages,
-    clipped_surrogate,
-    pessimistic_relief,
-    surrogate,
-)
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 

@@ -26,6 +26,9 @@ import torch
 from torch import Tensor
 
 from recrl.agents.algorithms.own_options import P3OConfig
+from recrl.agents.building_blocks.learning_batch import LearningBatch, to_tensor
+from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.surrogates import SignedAdvantages, clipped_surrogate, pessimistic_relief
 from recrl.agents.constraints.relative_units import RelativeConstraints, RelativeUnits
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
@@ -34,10 +37,7 @@ from recrl.agents.learning.gradient_ascent import (
     RadiusRule,
     normalised_by_penalties,
 )
-from recrl.agents.learning.learning_batch import LearningBatch, to_tensor
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import indexed, no_steps
-from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, pessimistic_relief
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 

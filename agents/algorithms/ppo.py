@@ -11,13 +11,13 @@ from functools import partial
 import numpy as np
 
 from recrl.agents.algorithms.own_options import PPOConfig
+from recrl.agents.building_blocks.advantages import standardised_rewards
+from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.surrogates import SignedAdvantages, clipped_surrogate
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.advantages import standardised_rewards
 from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, with_entropy
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import indexed
-from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate
 from recrl.environments.cmdp import CMDPSpec
 
 

@@ -19,15 +19,15 @@ import numpy as np
 from torch import Tensor
 
 from recrl.agents.algorithms.own_options import PPOLagConfig
+from recrl.agents.building_blocks.advantages import penalised_advantages
+from recrl.agents.building_blocks.learning_batch import LearningBatch
+from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.advantages import penalised_advantages
 from recrl.agents.learning.gradient_ascent import FirstOrderRule, Objective, with_entropy
-from recrl.agents.learning.learning_batch import LearningBatch
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import indexed
-from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 
 from recrl.agents.algorithms.own_options import TRPOConfig
+from recrl.agents.building_blocks.advantages import standardised_rewards
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.advantages import standardised_rewards
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful, indexed
 from recrl.agents.shared_options import TrustRegionConfig
 from recrl.agents.trust_region.conjugate_gradient import conjugate_gradient

@@ -17,10 +17,10 @@ import numpy as np
 
 from recrl.agents.algorithms.own_options import TRPOLagConfig
 from recrl.agents.algorithms.trpo import trust_region_step
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.constraints.multipliers import Multipliers
 from recrl.agents.experience import Experience
 from recrl.agents.learning.actor_critic import ActorCritic, fresh_agent
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful, indexed
 from recrl.environments.cmdp import CMDPSpec
 

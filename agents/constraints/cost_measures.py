@@ -40,6 +40,7 @@ import numpy.typing as npt
 
 from recrl.agents.agent import Rollout
 from recrl.agents.constraints.life_table import LifeTable
+from recrl.agents.experience import Constraints
 from recrl.environments.cmdp import Floats
 
 
@@ -195,6 +196,11 @@ class MeasuredCosts:
     values: Floats
     standard_errors: Floats
     episode_length: float
+
+    def against(self, limits: Floats) -> Constraints:
+        """Compare the constrained values with the limits, [k]."""
+        gaps = np.where(np.isfinite(limits), self.values - limits, -np.inf)
+        return Constraints(limits, gaps, self.standard_errors, self.episode_length)
 
 
 class MeanCost:

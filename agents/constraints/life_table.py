@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from recrl.agents.agent import Rollout
-from recrl.agents.learning.scales import quotient
+from recrl.agents.building_blocks.scales import quotient
 from recrl.environments.cmdp import Floats
 
 

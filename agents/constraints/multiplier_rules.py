@@ -23,7 +23,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from recrl.agents.learning.scales import quotient
+from recrl.agents.building_blocks.scales import quotient
 from recrl.environments.cmdp import Floats
 
 MultiplierState = Mapping[str, Floats]

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from recrl.agents.building_blocks.advantages import penalised_advantages, reward_spread
 from recrl.agents.constraints.multiplier_rules import (
     STARTS,
     MultiplierState,
@@ -32,7 +33,6 @@ from recrl.agents.constraints.multiplier_rules import (
 )
 from recrl.agents.constraints.relative_units import RelativeUnits
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.advantages import penalised_advantages, reward_spread
 from recrl.agents.shared_options import LagrangianConfig
 from recrl.environments.cmdp import Floats
 

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from recrl.agents.building_blocks.advantages import reward_spread
+from recrl.agents.building_blocks.scales import RunningScale, quotient
 from recrl.agents.experience import ActiveConstraints, Experience
-from recrl.agents.learning.advantages import reward_spread
-from recrl.agents.learning.scales import RunningScale, quotient
 from recrl.environments.cmdp import Floats
 
 

@@ -1,1 +1,1 @@
-"""Common parts of all algorithms: actor and critics, policies, advantages, batches, surrogates."""
+"""How an actor and critics learn: the skeleton of all algorithms, their rules, gradient ascent, averages."""

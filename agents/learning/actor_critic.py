@@ -24,17 +24,17 @@ import torch
 from torch import Tensor
 
 from recrl.agents.agent import Rollout
+from recrl.agents.building_blocks.advantages import generalised_advantages, next_values
+from recrl.agents.building_blocks.critics import Critics
+from recrl.agents.building_blocks.learning_batch import LearningBatch
+from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.scales import RunningScale, quotient
 from recrl.agents.constraints.cost_measures import MeanCost, RecentEpisodes, TailCost
 from recrl.agents.errors import require_finite
-from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.advantages import generalised_advantages, next_values
-from recrl.agents.learning.critics import Critics
+from recrl.agents.experience import Experience
 from recrl.agents.learning.estimates import Estimates, row_targets
 from recrl.agents.learning.final_policy import NetworkPolicy, PolicyAverage
-from recrl.agents.learning.learning_batch import LearningBatch
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, Stateful, improve_and_measure, indexed, united
-from recrl.agents.learning.scales import RunningScale, quotient
 from recrl.agents.networks.architecture import INITIALISERS, NetworkArchitecture
 from recrl.agents.networks.flat_parameters import Adam
 from recrl.agents.observation_features import Encoder
@@ -136,7 +136,7 @@ class ActorCritic(NetworkPolicy):
         measured = self._constraint.measure(rollout, episodes, limits)
         estimates = self._estimate(rollout, measured.step_costs, batch)
         advantages = estimates.advantages
-        constraints = Constraints.of(measured, limits)
+        constraints = measured.against(limits)
         experience = Experience.of(self._network, batch, advantages, constraints)
         if step.entropy_coefficient:
             experience = experience.with_entropy(step.entropy_coefficient)
@@ -227,7 +227,7 @@ class ActorCritic(NetworkPolicy):
         return {"value_loss_reward": float(mean[0])} | indexed("value_loss_cost", mean[1:])
 
     def add_noise(self, noise: float, observations: npt.NDArray[np.float32]) -> dict[str, float]:
-        """Make the policy more random once; see ``recrl.agents.learning.noise_scales``."""
+        """Make the policy more random once; see ``recrl.agents.building_blocks.noise_scales``."""
         with self._on_its_device():
             metrics = self._network.add_noise(noise, self._encoder(observations), self._config.noise_form)
         self._network.publish()

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from recrl.agents.learning.learning_batch import LearningBatch, to_tensor
+from recrl.agents.building_blocks.learning_batch import LearningBatch, to_tensor
+from recrl.agents.building_blocks.scales import quotient
 from recrl.agents.learning.policy_rule import indexed
-from recrl.agents.learning.scales import quotient
 from recrl.environments.cmdp import Floats
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.observation_features import Encoder
 from recrl.agents.torch_export import PolicyModule
 from recrl.environments.cmdp import Floats

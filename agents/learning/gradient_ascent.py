@@ -18,11 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recrl.agents.building_blocks.distributions import Distribution, mean_divergence
+from recrl.agents.building_blocks.learning_batch import LearningBatch
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import Experience
-from recrl.agents.learning.distributions import Distribution, mean_divergence
-from recrl.agents.learning.learning_batch import LearningBatch
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import Stateful
 from recrl.agents.networks.flat_parameters import Adam
 from recrl.agents.shared_options import AscentConfig, RadiusConfig

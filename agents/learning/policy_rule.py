@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from recrl.agents.building_blocks.distributions import mean_divergence
+from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.surrogates import surrogate
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.distributions import mean_divergence
-from recrl.agents.learning.policies import StochasticPolicy
-from recrl.agents.learning.surrogates import surrogate
 
 
 class Stateful(Protocol):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.networks.flat_parameters import FlatParameters
 from recrl.agents.shared_options import TrustRegionConfig
 

@@ -17,12 +17,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from recrl.agents.building_blocks.distributions import Distribution, mean_divergence
+from recrl.agents.building_blocks.learning_batch import to_tensor
+from recrl.agents.building_blocks.policies import FisherMetric, StochasticPolicy
+from recrl.agents.building_blocks.surrogates import surrogate
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import ActiveConstraints, Experience
-from recrl.agents.learning.distributions import Distribution, mean_divergence
-from recrl.agents.learning.learning_batch import to_tensor
-from recrl.agents.learning.policies import FisherMetric, StochasticPolicy
-from recrl.agents.learning.surrogates import surrogate
 from recrl.agents.shared_options import TrustRegionConfig
 from recrl.agents.trust_region.conjugate_gradient import conjugate_gradient
 from recrl.agents.trust_region.cpo_dual import DualSolution, StepProblem

@@ -3,8 +3,8 @@
 from pydantic import Field
 
 from recrl.agents.algorithms.trpo import trust_region_step
+from recrl.agents.building_blocks.advantages import standardised_advantages
 from recrl.agents.learning.actor_critic import fresh_agent
-from recrl.agents.learning.advantages import standardised_advantages
 from recrl.agents.learning.policy_rule import indexed
 from recrl.agents.registry import AgentEntry
 from recrl.agents.shared_options import TrustRegionConfig

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from gymnasium.spaces import Space
 
-from recrl.agents.learning.learning_batch import LearningBatch
-from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.building_blocks.learning_batch import LearningBatch
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.environments.cmdp import Floats
 

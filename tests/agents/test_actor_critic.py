@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from recrl.agents.agent import Rollout
+from recrl.agents.building_blocks.learning_batch import LearningBatch
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.learning.actor_critic import ActorCritic
-from recrl.agents.learning.learning_batch import LearningBatch
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep, Floats
 from recrl.environments.registry import make_vector

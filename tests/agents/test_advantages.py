@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from recrl.agents.learning.advantages import generalised_advantages, next_values
+from recrl.agents.building_blocks.advantages import generalised_advantages, next_values
 from recrl.environments.cmdp import Floats
 
 

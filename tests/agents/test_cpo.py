@@ -11,8 +11,8 @@ from gymnasium.spaces import Box, Discrete, Space
 from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation, acceptance
 from recrl.agents.algorithms.own_options import CPOConfig
 from recrl.agents.algorithms.pcpo import projected_step
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.experience import ActiveConstraints, Constraints, Experience
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import improve_and_measure
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.agents.trust_region.cpo_dual import DualSolution, StepCase, StepProblem, solve_dual

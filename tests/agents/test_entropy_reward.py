@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from recrl.agents.building_blocks.distributions import Categorical, Distribution, Gaussian
+from recrl.agents.building_blocks.learning_batch import LearningBatch
+from recrl.agents.building_blocks.surrogates import surrogate
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.distributions import Categorical, Distribution, Gaussian
-from recrl.agents.learning.learning_batch import LearningBatch
-from recrl.agents.learning.surrogates import surrogate
 from recrl.environments.cmdp import Floats
 
 TEMPERATURE = 0.7

@@ -17,10 +17,10 @@ from recrl.agents.algorithms.ipo import (
 )
 from recrl.agents.algorithms.own_options import FOCOPSConfig, IPOConfig, P3OConfig
 from recrl.agents.algorithms.p3o import PenalisedProximalPolicyOptimisation, penalised_surrogate_objective
+from recrl.agents.building_blocks.distributions import Categorical
+from recrl.agents.building_blocks.learning_batch import LearningBatch
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.distributions import Categorical
-from recrl.agents.learning.learning_batch import LearningBatch
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.environments.cmdp import Floats

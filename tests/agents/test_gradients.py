@@ -13,14 +13,14 @@ from recrl.agents.algorithms.ipo import barrier_surrogate_objective
 from recrl.agents.algorithms.own_options import IPOConfig
 from recrl.agents.algorithms.p3o import penalised_surrogate_objective
 from recrl.agents.algorithms.ppo_lag import combined_surrogate_objective, separate_surrogate_objective
+from recrl.agents.building_blocks.critics import Critics
+from recrl.agents.building_blocks.distributions import Distribution
+from recrl.agents.building_blocks.learning_batch import LearningBatch
+from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 from recrl.agents.constraints.relative_units import RelativeConstraints, RelativeUnits
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.critics import Critics
-from recrl.agents.learning.distributions import Distribution
 from recrl.agents.learning.gradient_ascent import Objective, with_entropy
-from recrl.agents.learning.learning_batch import LearningBatch
-from recrl.agents.learning.policies import StochasticPolicy
-from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 from recrl.agents.networks import tanh_stack
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.agents.networks.flat_parameters import FlatParameters

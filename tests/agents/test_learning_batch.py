@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from recrl.agents.learning.learning_batch import LearningBatch, find_repeated
-from recrl.agents.learning.surrogates import SignedAdvantages, clipped_surrogate, surrogate
+from recrl.agents.building_blocks.learning_batch import LearningBatch, find_repeated
+from recrl.agents.building_blocks.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 
 ROWS = np.eye(4, dtype=np.float32)
 STATES = np.array([0, 1, 0, 2, 0, 1, 0, 2, 2, 1])

@@ -19,9 +19,9 @@ from recrl.agents.algorithms.crpo import (
 from recrl.agents.algorithms.own_options import CRPOConfig, PCPOConfig, TRPOLagConfig
 from recrl.agents.algorithms.pcpo import projected_step
 from recrl.agents.algorithms.trpo_lag import TRPOLagrangian
+from recrl.agents.building_blocks.learning_batch import LearningBatch
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.learning_batch import LearningBatch
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.agents.trust_region.cpo_dual import StepCase, StepProblem, projection_weights

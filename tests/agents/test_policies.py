@@ -6,9 +6,9 @@ import torch
 from gymnasium.spaces import Box, Discrete, Space
 from torch import Tensor
 
-from recrl.agents.learning.distributions import Categorical, Gaussian, mean_divergence
-from recrl.agents.learning.noise_scales import matching_log_std, matching_scale, off_greedy_mass
-from recrl.agents.learning.policies import FisherMetric, StochasticPolicy
+from recrl.agents.building_blocks.distributions import Categorical, Gaussian, mean_divergence
+from recrl.agents.building_blocks.noise_scales import matching_log_std, matching_scale, off_greedy_mass
+from recrl.agents.building_blocks.policies import FisherMetric, StochasticPolicy
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.agents.networks.tanh_stack import TanhStack
 

@@ -11,16 +11,16 @@ from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation
 from recrl.agents.algorithms.own_options import CPOConfig, PPOConfig, TRPOConfig
 from recrl.agents.algorithms.ppo import ProximalPolicyOptimisation
 from recrl.agents.algorithms.trpo import TrustRegionPolicyOptimisation, trust_region_step
+from recrl.agents.building_blocks.advantages import penalised_advantages
+from recrl.agents.building_blocks.distributions import Categorical, Distribution, mean_divergence
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.advantages import penalised_advantages
-from recrl.agents.learning.distributions import Categorical, Distribution, mean_divergence
 from recrl.agents.learning.gradient_ascent import (
     Objective,
     gradient_ascent,
     normalised_by_penalties,
     with_entropy,
 )
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
 from recrl.agents.networks.flat_parameters import Adam
 from recrl.environments.cmdp import Floats

@@ -9,11 +9,11 @@ from gymnasium.spaces import Discrete
 
 from recrl.agents.algorithms.own_options import PPOLagConfig
 from recrl.agents.algorithms.ppo_lag import SURROGATE_OBJECTIVES, PPOLagrangian
+from recrl.agents.building_blocks.advantages import standardised_rewards
+from recrl.agents.building_blocks.learning_batch import LearningBatch
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.constraints.cost_measures import MeasuredCosts
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.advantages import standardised_rewards
-from recrl.agents.learning.learning_batch import LearningBatch
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.learning.policy_rule import improve_and_measure
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 
@@ -128,11 +128,11 @@ def test_a_separate_penalty_is_not_clipped_by_hand() -> None:
 
 def test_gaps_are_measured_costs_minus_limits() -> None:
     measured = MeasuredCosts(np.zeros((1, 1, 1)), np.array([3.0]), np.array([1.0]), 20.0)
-    found = Constraints.of(measured, np.array([1.0]))
+    found = measured.against(np.array([1.0]))
     assert (found.episode_length, found.gaps.tolist(), found.standard_errors.tolist()) == (20.0, [2.0], [1.0])
 
 
 def test_without_an_episode_only_infinite_limits_are_known_to_be_kept() -> None:
     unknown = MeasuredCosts(np.zeros((1, 1, 2)), np.full(2, np.nan), np.zeros(2), math.nan)
-    assert not Constraints.of(unknown, np.array([math.inf, 1.0])).known
-    assert Constraints.of(unknown, np.array([math.inf, math.inf])).known
+    assert not unknown.against(np.array([math.inf, 1.0])).known
+    assert unknown.against(np.array([math.inf, math.inf])).known

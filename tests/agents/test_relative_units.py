@@ -7,10 +7,10 @@ import pytest
 import torch
 from gymnasium.spaces import Discrete
 
+from recrl.agents.building_blocks.learning_batch import LearningBatch
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.constraints.relative_units import RelativeConstraints, RelativeUnits
 from recrl.agents.experience import Constraints, Experience
-from recrl.agents.learning.learning_batch import LearningBatch
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.environments.cmdp import Floats
 

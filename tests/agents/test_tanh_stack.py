@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from recrl.agents.learning.critics import Critics
+from recrl.agents.building_blocks.critics import Critics
 from recrl.agents.networks import tanh_stack
 from recrl.agents.networks.architecture import INITIALISERS, NetworkArchitecture, orthogonal, xavier
 from recrl.agents.networks.flat_parameters import Adam, FlatParameters

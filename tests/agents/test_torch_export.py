@@ -7,7 +7,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 
-from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.networks.architecture import INITIALISERS, NetworkArchitecture
 from recrl.agents.networks.module_stack import perceptron
 from recrl.agents.observation_features import Encoder

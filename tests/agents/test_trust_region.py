@@ -8,7 +8,7 @@ import torch
 from gymnasium.spaces import Box
 
 from recrl.agents.algorithms.own_options import TRPOConfig
-from recrl.agents.learning.policies import StochasticPolicy
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.agents.networks.flat_parameters import FlatParameters
 from recrl.agents.trust_region.conjugate_gradient import conjugate_gradient

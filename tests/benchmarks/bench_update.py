@@ -31,10 +31,10 @@ import torch
 from gymnasium.spaces import Box
 
 from recrl.agents.agent import Rollout
+from recrl.agents.building_blocks.critics import Critics
+from recrl.agents.building_blocks.learning_batch import find_repeated
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.collection import Collector, episode_costs
-from recrl.agents.learning.critics import Critics
-from recrl.agents.learning.learning_batch import find_repeated
-from recrl.agents.learning.policies import StochasticPolicy
 from recrl.agents.networks.architecture import NetworkArchitecture, xavier
 from recrl.agents.networks.flat_parameters import Adam
 from recrl.agents.registry import AGENTS, agent_config, make_agent

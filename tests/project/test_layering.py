@@ -85,6 +85,17 @@ LAYERS = (
     ("cli",),
 )
 
+AGENT_LAYERS = (  # likewise inside the agents
+    ("agent", "errors", "observation_features", "shared_options", "spaces"),
+    ("collection", "networks"),
+    ("building_blocks", "evaluation"),
+    ("experience", "torch_export"),
+    ("constraints", "trust_region"),
+    ("learning",),
+    ("algorithms",),
+    ("registry",),
+)
+
 
 def imports(tree: ast.AST, *, at_run_time: bool = False) -> Iterator[str]:
     """Every dotted name that is imported; with ``at_run_time``, without those for type checkers only."""
@@ -154,16 +165,17 @@ def test_each_third_party_system_has_its_adapter() -> None:
     assert not wrong, "\n".join(wrong)
 
 
-def test_the_orchestrator_has_layers() -> None:
-    height = {name: level for level, names in enumerate(LAYERS) for name in names}
-    folder = ROOT / "orchestrator"
+@pytest.mark.parametrize(("package", "layers"), [("orchestrator", LAYERS), ("agents", AGENT_LAYERS)])
+def test_a_package_has_layers(package: str, layers: tuple[tuple[str, ...], ...]) -> None:
+    height = {name: level for level, names in enumerate(layers) for name in names}
+    folder = ROOT / package
     parts_of = {path.relative_to(folder).parts[0].removesuffix(".py") for path in folder.rglob("*.py")}
-    assert set(height) == parts_of - {"__init__"}, "every folder and module has its place in LAYERS"
+    assert set(height) == parts_of - {"__init__"}, "every folder and module has its place"
     for path in folder.rglob("*.py"):
         own = path.relative_to(folder).parts[0].removesuffix(".py")
         for name in imports(parsed(path), at_run_time=True):
             parts = name.split(".")
-            if parts[:2] == ["recrl", "orchestrator"] and len(parts) > 2 and own != "__init__":
+            if parts[:2] == ["recrl", package] and len(parts) > 2 and own != "__init__":
                 assert height[parts[2]] <= height[own], f"{dotted(path)} imports {name}"
 
 

@@ -1,8 +1,8 @@
 """Surrogate objectives of policy gradient methods, over the pairs of a batch.
 
 A surrogate is a mean over samples. Each term depends only on the probability ratio of the sample's pair and,
-linearly, on its advantage. So advantages are summed by pair first (``recrl.agents.learning.learning_batch``).
-Notation: N samples, D unique pairs, k costs.
+linearly, on its advantage. So advantages are summed by pair first
+(``recrl.agents.building_blocks.learning_batch``). Notation: N samples, D unique pairs, k costs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recrl.agents.learning.learning_batch import LearningBatch
+from recrl.agents.building_blocks.learning_batch import LearningBatch
 from recrl.environments.cmdp import Floats
 
 

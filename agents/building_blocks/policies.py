@@ -21,9 +21,9 @@ import torch
 from gymnasium.spaces import Discrete
 from torch import Tensor
 
-from recrl.agents.learning.distributions import Categorical, Distribution, Gaussian
-from recrl.agents.learning.learning_batch import find_repeated
-from recrl.agents.learning.noise_scales import matching_log_std, matching_scale, off_greedy_mass
+from recrl.agents.building_blocks.distributions import Categorical, Distribution, Gaussian
+from recrl.agents.building_blocks.learning_batch import find_repeated
+from recrl.agents.building_blocks.noise_scales import matching_log_std, matching_scale, off_greedy_mass
 from recrl.agents.networks.architecture import NetworkArchitecture
 from recrl.agents.networks.network_stack import make_stack
 from recrl.agents.networks.tanh_stack import Scratch, TanhStack, blocks
@@ -195,7 +195,7 @@ class StochasticPolicy:
         return Gaussian(outputs, log_std)
 
     def add_noise(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
-        """Make the policy more random, once; see ``recrl.agents.learning.noise_scales``.
+        """Make the policy more random, once; see ``recrl.agents.building_blocks.noise_scales``.
 
         Args:
             noise: eps_pi in (0, 1].

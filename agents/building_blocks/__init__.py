@@ -1,0 +1,1 @@
+"""Parts of which agents are built: policies, critics, advantages, batches, surrogates, running scales."""
