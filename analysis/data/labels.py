@@ -18,6 +18,7 @@ from recrl.orchestrator.spec import TrialSpec
 
 KEY = ("task", "agent", "method", "seed")
 GROUP = ("task", "agent", "method")
+BASELINE = "none"  # the method that others are compared with, where nothing else is said
 AGENT_ORDER = ("ppo-lag", "cpo")
 METHOD_ORDER = (
     "none",

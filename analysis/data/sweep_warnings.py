@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from recrl.analysis.data.labels import KEY, listed
+from recrl.analysis.data.labels import BASELINE, KEY, listed
 from recrl.analysis.data.sweep_data import Sweep, TrialFacts
 from recrl.orchestrator.files.trial_warnings import (
     HARD_LANDING,
@@ -26,8 +26,6 @@ from recrl.orchestrator.provenance.code_changes import (
     other_code_sentence,
 )
 from recrl.orchestrator.spec import TrialStatus
-
-BASELINE = "none"  # of ``metrics.comparisons``
 
 _Ran = Mapping[str, set[str]]  # digests of code, or versions, by the name of the package
 

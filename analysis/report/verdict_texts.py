@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from recrl.analysis.data.cost_names import cost_suffix
+from recrl.analysis.data.labels import BASELINE
 from recrl.analysis.data.number_texts import DASH, number, with_error
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report.table_formats import not_corrected, with_interval
@@ -18,7 +19,6 @@ from recrl.orchestrator.files.outcomes_file import FAILED, FEASIBLE, INFEASIBLE,
 from recrl.orchestrator.spec import MEASURING_NOTHING, TrialStatus
 
 DEPLOYMENT = "deployment phase (learning goes on)"
-BASELINE = "none"
 DIFFERENCE = "difference to none"
 UNEVALUATED = "not evaluated"
 WARNINGS = {

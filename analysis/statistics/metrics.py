@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from recrl.analysis.data.labels import GROUP, KEY
+from recrl.analysis.data.labels import BASELINE, GROUP, KEY
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.statistics.intervals import (
     Interval,
@@ -29,8 +29,6 @@ from recrl.analysis.statistics.intervals import (
 from recrl.analysis.statistics.verdicts import is_cost, solved, tie, within_limits, worst_costs
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.spec import TrialStatus
-
-BASELINE = "none"  # the method that others are compared with, where nothing else is said
 
 
 class Measure(StrEnum):
