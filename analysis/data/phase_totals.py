@@ -15,7 +15,7 @@ def phase_totals(episodes: pd.DataFrame, deploy_limits: Sequence[float]) -> list
     """Sum over a trial's episodes, one row per phase with episodes.
 
     Args:
-        episodes: ``TrialStore.episodes()``.
+        episodes: ``TrialReader.episodes()``.
         deploy_limits: d_d, [k].
 
     Returns:

@@ -55,7 +55,7 @@ from recrl.environments.finite.finite_cmdp import FiniteCMDP
 from recrl.orchestrator.errors import DamagedError, RecrlError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import EPISODE_COLUMNS, EVALUATION_COLUMNS, UPDATE_COLUMNS
-from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.files.trial_reader import TrialReader
 from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.untrusted import checked_name
 
@@ -256,7 +256,7 @@ def load_episodes(
         sweep = SweepStore(sweep.folder.parent, sweep.folder.name)
     specs, trials = _trials(sweep)
 
-    def rows(trial: TrialStore) -> pd.DataFrame:
+    def rows(trial: TrialReader) -> pd.DataFrame:
         try:
             episodes = trial.episodes()
         except DamagedError as error:
@@ -374,13 +374,13 @@ def _trial_row(trial: TrialFacts, optimum: float) -> dict[str, Any]:
     return row
 
 
-def _trials(store: SweepStore) -> tuple[list[TrialSpec], list[TrialStore]]:
+def _trials(store: SweepStore) -> tuple[list[TrialSpec], list[TrialReader]]:
     """Return the trials of the sweep's last launch."""
     specs = store.specs()
     return specs, [store.trial(spec) for spec in specs]
 
 
-def _read(spec: TrialSpec, trial: TrialStore) -> tuple[TrialFacts, dict[str, pd.DataFrame]]:
+def _read(spec: TrialSpec, trial: TrialReader) -> tuple[TrialFacts, dict[str, pd.DataFrame]]:
     """Return a trial's facts and its rows of the data frames ROWS; no rows for a damaged trial."""
     record = trial.record()
     if record.status is not TrialStatus.DAMAGED:
@@ -408,10 +408,10 @@ def _read(spec: TrialSpec, trial: TrialStore) -> tuple[TrialFacts, dict[str, pd.
     return damaged, {name: pd.DataFrame() for name in ROWS}
 
 
-def _event_rows(trial: TrialStore) -> pd.DataFrame:
+def _event_rows(trial: TrialReader) -> pd.DataFrame:
     return pd.DataFrame([{name: event.get(name) for name in EVENT_COLUMNS} for event in trial.events()])
 
 
-def _policy_rows(trial: TrialStore) -> pd.DataFrame:
+def _policy_rows(trial: TrialReader) -> pd.DataFrame:
     policy = trial.policy()
     return policy.rename_axis("state").reset_index() if len(policy) else policy

@@ -13,7 +13,7 @@ from recrl.analysis.data.number_texts import DASH, number
 from recrl.analysis.statistics.claims import CLAIMS, Comparison
 from recrl.analysis.statistics.intervals import share_text
 from recrl.environments.cmdp import Phase
-from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.files.trial_reader import TrialReader
 
 SUM_COLUMNS = {
     "cost": "cost_sum",
@@ -117,7 +117,7 @@ def admissible_table(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def replay_summary(trial: TrialStore, rows: pd.DataFrame) -> pd.DataFrame:
+def replay_summary(trial: TrialReader, rows: pd.DataFrame) -> pd.DataFrame:
     """Summarise the differences between replay and record: one row per cost, as text.
 
     Args:

@@ -19,13 +19,13 @@ import pandas as pd
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.orchestrator.errors import RecrlError
-from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.files.trial_reader import TrialReader
 from recrl.orchestrator.spec import Choice
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec
 
 
-def replay(trial: TrialStore, method: Choice) -> pd.DataFrame:
+def replay(trial: TrialReader, method: Choice) -> pd.DataFrame:
     """Compute a curriculum's limits on a run's recorded episodes: one row per policy update.
 
     Args:
@@ -62,7 +62,7 @@ def replay(trial: TrialStore, method: Choice) -> pd.DataFrame:
     return updates[columns].assign(**limits, replayed_noise=[each.policy_noise for each in steps])
 
 
-def progress_reports(trial: TrialStore, updates: pd.DataFrame) -> Iterator[ProgressReport]:
+def progress_reports(trial: TrialReader, updates: pd.DataFrame) -> Iterator[ProgressReport]:
     """Yield the trial's report to its teacher after each policy update.
 
     Args:
