@@ -68,8 +68,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("tables", nargs="+", type=Path, metavar="TABLE")
     parser.add_argument("--compare", nargs=2, default=["dynamic", "none"], metavar="CURRICULUM")
+    parser.add_argument("--task", help="only this map, rivergrid-1a or rivergrid-1b")
     given = parser.parse_args(arguments)
     rows = judged(pd.concat([pd.read_csv(table) for table in given.tables], ignore_index=True))
+    rows = rows[rows["task"] == given.task] if given.task else rows
     for policy in ("average", "last"):
         chosen = rows[rows["policy"] == policy]
         print(f"\n{policy}: {int(chosen['solved'].sum())} of {len(chosen)} solved")

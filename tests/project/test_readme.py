@@ -114,7 +114,8 @@ def test_the_table_of_rivergrid_is_counted() -> None:
     infeasible = (on_1b["cost"] > 1.01 * on_1b["limit"]).sum()
     assert f"On 1b {infeasible} of {len(on_1b)} policies cost more than 1% above the limit" in CLAIMS
     assert not solved.loc["rivergrid-1b", ["linear", "cosine", "exponential"]].to_numpy().any()
-    assert f"static curricula solve none of {len(on_1b)}." in README
+    assert solved.loc["rivergrid-1a", ["linear", "cosine", "exponential"]].to_numpy().all()
+    assert f"static curricula solve 1a in {len(on_1b)} of {len(on_1b)} trials and 1b in none." in README
 
 
 def test_the_table_of_fresh_seeds_on_rivergrid_is_counted() -> None:
@@ -128,6 +129,9 @@ def test_the_table_of_fresh_seeds_on_rivergrid_is_counted() -> None:
     pairs = f"In {(dynamic & ~none).sum()} pairs only `dynamic` solves the map, in "
     assert (none & ~dynamic).sum() == 0
     assert f"{counted} {pairs}none only `none`." in README
+    of_1b = solved.loc["rivergrid-1b"]
+    without_noise = f"{of_1b['without-noise'].sum()} of {len(of_1b)} against {of_1b['none'].sum()}"
+    assert f"On 1b a relaxed limit without noise harms: {without_noise}." in README
 
 
 def test_definitions_are_still_used() -> None:
