@@ -87,7 +87,7 @@ def step_grid(boundary_step: int, total_steps: int, *, updates: int, bins: int) 
 
 @dataclass(frozen=True)
 class Extent:
-    """Steps and updates that trials have in common in a figure.
+    """The environment steps that a figure of several trials shows, and the policy updates in them.
 
     Attributes:
         boundary: first environment step under d_d, of the trial that comes to it first.

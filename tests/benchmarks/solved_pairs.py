@@ -47,20 +47,17 @@ def lines(rows: pd.DataFrame, first: str, second: str) -> Iterator[str]:
         first: a curriculum.
         second: another one, with the same seeds.
     """
-    by_group = rows.groupby(["method", "task", "agent"])["solved"]
-    yield by_group.agg(["sum", "count"]).unstack(["task", "agent"])["sum"].to_string()
-    wide = rows.pivot(index=PAIR, columns="method", values="solved").loc[:, [first, second]].dropna()
+    counts = rows.groupby(["method", "task", "agent"])["solved"].sum()
+    yield counts.unstack(["task", "agent"]).to_string()
+    pairs = rows.pivot(index=PAIR, columns="method", values="solved")[[first, second]].dropna().astype(bool)
     only = pd.DataFrame(
-        {
-            each: wide[each].astype(bool) & ~wide[other].astype(bool)
-            for each, other in ((first, second), (second, first))
-        }
+        {first: pairs[first] & ~pairs[second], second: pairs[second] & ~pairs[first]}, dtype=int
     )
-    yield f"pairs that only one solves, of {len(wide)}:"
+    yield f"pairs that only one solves, of {len(pairs)}:"
     yield only.groupby(["task", "agent"]).sum().to_string()
-    ones, others = (int(only[each].sum()) for each in (first, second))
-    p = binomtest(ones, ones + others).pvalue if ones + others else 1.0
-    yield f"together: {first} {ones}, {second} {others}, exact p {p:.4f}"
+    one, other = only.sum()
+    p = binomtest(one, one + other).pvalue if one + other else 1.0
+    yield f"together: {first} {one}, {second} {other}, exact p {p:.4f}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
