@@ -22,6 +22,7 @@ from pydantic import Field
 
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.untrusted import ChoiceFile, LimitValues, check_json, file_model
+from recrl.teachers.registry import may_measure_start
 from recrl.teachers.teacher import TeacherSpec
 
 
@@ -38,9 +39,6 @@ class TrialStatus(StrEnum):
     def is_finished(self) -> bool:
         """Whether another launch of the same grid would leave the trial alone."""
         return self in (TrialStatus.COMPLETE, TrialStatus.FAILED)
-
-
-MEASURING_NOTHING = ("none", "step", "unconstrained", "cooling")  # curricula, whatever d_t is
 
 
 @dataclass(frozen=True)
@@ -143,7 +141,7 @@ class TrialSpec:
             start_limits: the measured d_t, [k]; None if it was not measured.
         """
         is_given = all(map(math.isfinite, self.train_limits))
-        if start_limits is None or is_given or self.method.name in MEASURING_NOTHING:
+        if start_limits is None or is_given or not may_measure_start(self.method.name):
             return False
         pairs = zip(start_limits, self.deploy_limits, strict=True)
         return all(float(start) <= deploy for start, deploy in pairs)

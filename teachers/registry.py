@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -14,6 +14,7 @@ from recrl.teachers.cooling import CoolingConfig, CoolingTeacher
 from recrl.teachers.dynamic import DynamicTeacher
 from recrl.teachers.dynamic_options import DynamicConfig
 from recrl.teachers.static import (
+    Decay,
     DecayConfig,
     NoConfig,
     cosine,
@@ -35,41 +36,56 @@ class TeacherKind:
         summary: one sentence of description.
         config: the pydantic model of its options.
         make: builds it, from options that ``config`` has accepted.
+        measures_start: whether it measures an infinite d_t, as a mean cost, as ``StartMeasurement`` does.
+        compares_costs: whether it compares mean costs of episodes with its limits.
+        rewards_entropy: whether its steps have an entropy coefficient. It is then refused for continuous
+            actions, because the entropy of a Gaussian policy has no bound.
+        is_control: whether it keeps d_t until the deployment phase, so that a hard landing is no mistake.
     """
 
     summary: str
     config: type[BaseModel]
     make: Callable[[TeacherSpec], Teacher]
+    measures_start: bool = field(default=False, kw_only=True)
+    compares_costs: bool = field(default=False, kw_only=True)
+    rewards_entropy: bool = field(default=False, kw_only=True)
+    is_control: bool = field(default=False, kw_only=True)
+
+
+def _decay(summary: str, decay: Decay) -> TeacherKind:
+    """Return the entry of a decay from d_t, or from the measured costs, to d_d."""
+    return TeacherKind(summary, DecayConfig, partial(decay_teacher, decay=decay), measures_start=True)
 
 
 TEACHERS: dict[str, TeacherKind] = {
     "none": TeacherKind("No curriculum: d_d from the start.", NoConfig, none_teacher),
     "step": TeacherKind(
-        "A control: d_t until the training steps end, then d_d at once.", NoConfig, step_teacher
+        "A control: d_t until the training steps end, then d_d at once.",
+        NoConfig,
+        step_teacher,
+        is_control=True,
     ),
     "unconstrained": TeacherKind(
         "A control: no limit until the training steps end, for any d_t, then d_d at once.",
         NoConfig,
         unconstrained_teacher,
+        is_control=True,
     ),
-    "linear": TeacherKind(
-        "CLiC_L: from d_t to d_d linearly.", DecayConfig, partial(decay_teacher, decay=linear)
-    ),
-    "cosine": TeacherKind(
-        "CLiC_C: from d_t to d_d, slowly at first.", DecayConfig, partial(decay_teacher, decay=cosine)
-    ),
-    "exponential": TeacherKind(
-        "CLiC_E: from d_t to d_d, fast at first.", DecayConfig, partial(decay_teacher, decay=exponential)
-    ),
+    "linear": _decay("CLiC_L: from d_t to d_d linearly.", linear),
+    "cosine": _decay("CLiC_C: from d_t to d_d, slowly at first.", cosine),
+    "exponential": _decay("CLiC_E: from d_t to d_d, fast at first.", exponential),
     "dynamic": TeacherKind(
         "CLiC_D: lower limits for an agent that keeps them, noise for an agent that is stuck.",
         DynamicConfig,
         DynamicTeacher,
+        measures_start=True,
+        compares_costs=True,
     ),
     "cooling": TeacherKind(
         "Ours: a rewarded entropy that is annealed, and a limit that falls with it.",
         CoolingConfig,
         CoolingTeacher,
+        rewards_entropy=True,
     ),
 }
 
@@ -88,6 +104,22 @@ def find_teacher(name: str) -> TeacherKind:
             "recrl.teachers.registry.TeacherKind('one sentence', Options, MyCurriculum) and name MINE"
         )
     return kind
+
+
+def may_measure_start(name: str) -> bool:
+    """Return whether a curriculum that was run may have measured an infinite d_t.
+
+    A user's curriculum may have; its code need not be there where results are read.
+
+    >>> may_measure_start("linear"), may_measure_start("none"), may_measure_start("their_package:MINE")
+    (True, False, True)
+    """
+    return name not in TEACHERS or TEACHERS[name].measures_start
+
+
+def is_known_control(name: str) -> bool:
+    """Return whether a curriculum is one of this package's that keep d_t until the deployment phase."""
+    return name in TEACHERS and TEACHERS[name].is_control
 
 
 def teacher_config(name: str, options: Mapping[str, Any]) -> BaseModel:

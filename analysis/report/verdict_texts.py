@@ -16,7 +16,8 @@ from recrl.analysis.report.table_formats import not_corrected, with_interval
 from recrl.analysis.statistics.verdicts import COST_TOLERANCE, SOLVED_GAP, is_cost
 from recrl.environments.registry import TASKS
 from recrl.orchestrator.files.outcomes_file import FAILED, FEASIBLE, INFEASIBLE, PENDING, SOLVED
-from recrl.orchestrator.spec import MEASURING_NOTHING, TrialStatus
+from recrl.orchestrator.spec import TrialStatus
+from recrl.teachers.registry import may_measure_start
 
 DEPLOYMENT = "deployment phase (learning goes on)"
 DIFFERENCE = "difference to none"
@@ -166,7 +167,7 @@ def _training_limits(trials: pd.DataFrame, i: int) -> str:
     """
     trials = trials[trials["method_name"] != BASELINE]  # without a curriculum the limit is d_d throughout
     given, start = trials[f"train_limit_{i}"], trials[f"start_limit_{i}"]
-    measures = ~trials["method_name"].isin(MEASURING_NOTHING)
+    measures = trials["method_name"].map(may_measure_start).astype(bool)
     measured = start[measures & np.isinf(given) & np.isfinite(start)]
     given = given[np.isfinite(given)]
     parts = [(measured, "measured at the start of training"), (given, "from the grid")]

@@ -49,5 +49,8 @@ class Halving:
 
 
 HALVING = TeacherKind(
-    "Halve the distance to d_d when the last episodes kept the limit.", HalvingConfig, Halving
+    "Halve the distance to d_d when the last episodes kept the limit.",
+    HalvingConfig,
+    Halving,
+    compares_costs=True,
 )

@@ -24,4 +24,6 @@ def plateau_teacher(spec: TeacherSpec) -> Teacher:
     return StaticTeacher(spec, decay=decay)
 
 
-PLATEAU = TeacherKind("d_t for a while, then a straight line to d_d.", PlateauConfig, plateau_teacher)
+PLATEAU = TeacherKind(
+    "d_t for a while, then a straight line to d_d.", PlateauConfig, plateau_teacher, measures_start=True
+)

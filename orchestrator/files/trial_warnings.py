@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterable, Sequence
 
 from recrl.orchestrator.spec import TrialSpec
+from recrl.teachers.registry import is_known_control
 
 HARD_LANDING, POLICY_NOISE = "hard landing", "policy noise"  # events
-CONTROLS = ("step", "unconstrained")  # curricula that keep d_t until deployment, as they should
 NAMED = 5  # trials in a sentence, at most
 
 
@@ -19,7 +19,7 @@ def landed_hard(spec: TrialSpec, events: Iterable[str]) -> bool:
         spec: the trial.
         events: the names of its events.
     """
-    return spec.method.name not in CONTROLS and HARD_LANDING in events
+    return HARD_LANDING in events and not is_known_control(spec.method.name)
 
 
 def no_curriculum_sentence(titles: Sequence[str]) -> str:

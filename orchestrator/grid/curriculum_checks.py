@@ -6,7 +6,8 @@ import math
 from collections.abc import Iterator
 
 from recrl.environments.cmdp import CMDPSpec
-from recrl.orchestrator.spec import MEASURING_NOTHING, TrialSpec
+from recrl.orchestrator.spec import TrialSpec
+from recrl.teachers.registry import find_teacher
 
 
 def unsuitable(trial: TrialSpec, cmdp: CMDPSpec) -> Iterator[tuple[str, str]]:
@@ -19,27 +20,27 @@ def unsuitable(trial: TrialSpec, cmdp: CMDPSpec) -> Iterator[tuple[str, str]]:
         trial: to be checked.
         cmdp: of its task.
     """
-    method, task = trial.method.name, trial.task.label
+    curriculum, method, task = find_teacher(trial.method.name), trial.method.label, trial.task.label
     if trial.agent.options.get("constraint") == "cvar":
-        if method == "dynamic":
+        if curriculum.compares_costs:
             yield (
                 "agents",
-                "constraint: cvar does not suit the method dynamic, which compares mean costs with the "
+                f"constraint: cvar does not suit the method {method}, which compares mean costs with the "
                 "limits; use constraint: mean, or exclude the pair",
             )
-        elif method not in MEASURING_NOTHING and not all(map(math.isfinite, trial.train_limits)):
+        elif curriculum.measures_start and not all(map(math.isfinite, trial.train_limits)):
             yield (
                 "agents",
                 f"constraint: cvar does not suit the train_limits of {task}, which are measured as mean "
                 "costs; give them as numbers, or exclude the pair",
             )
-    if method == "cooling" and cmdp.has_continuous_actions:
+    if curriculum.rewards_entropy and cmdp.has_continuous_actions:
         yield (
             "methods",
-            "cooling rewards the policy's entropy, which has no bound with the continuous actions of "
+            f"{method} rewards the policy's entropy, which has no bound with the continuous actions of "
             f"{task}; use another method, or exclude the pair",
         )
-    if method == "cooling" and not any(trial.deploy_limits):
+    if trial.method.name == "cooling" and not any(trial.deploy_limits):
         yield (
             "methods",
             f"cooling relaxes a limit in proportion to it, so the deploy_limits of {task}, 0, are never "

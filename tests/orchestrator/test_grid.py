@@ -220,6 +220,22 @@ def test_a_curriculum_of_mean_costs_does_not_go_with_limits_on_a_cvar() -> None:
     assert len(_grid(dynamic + "exclude: [{agent: ppo-lag, method: dynamic}]\n").trials()) == 6
 
 
+def test_a_curriculum_of_ones_own_declares_what_does_not_go_with_a_cvar(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_curricula.py").write_text(
+        "from recrl.teachers.registry import TeacherKind\n"
+        "from recrl.teachers.static import NoConfig, step_teacher\n"
+        "PLAIN = TeacherKind('d_t, then d_d.', NoConfig, step_teacher)\n"
+        "COMPARING = TeacherKind('d_t, then d_d.', NoConfig, step_teacher, compares_costs=True)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    worst = SMALL.replace("[ppo-lag]", "[{name: ppo-lag, options: {constraint: cvar}}]")
+    assert len(_grid(worst.replace("linear", '"own_curricula:PLAIN"')).trials()) == 4
+    (problem,) = _problems(worst.replace("linear", '{name: "own_curricula:COMPARING", label: mine}'))
+    assert problem.startswith("grid.yaml:3: agents.0: constraint: cvar does not suit the method mine, ")
+
+
 def test_cooling_cannot_relax_limits_of_0() -> None:
     (problem,) = _problems(SMALL.replace("linear", "cooling").replace("limits: 2", "limits: 0"))
     assert problem.startswith("grid.yaml:4: methods.1: cooling relaxes a limit in proportion to it, ")

@@ -4,6 +4,7 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -11,12 +12,12 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from recrl.environments.cmdp import CostLimits, CurriculumStep
+from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.environments.plugins import UnknownNameError
 from recrl.teachers.dynamic_options import PAPER, DynamicConfig
 from recrl.teachers.registry import TEACHERS, TeacherKind, find_teacher, make_teacher, teacher_config
 from recrl.teachers.static import NoConfig, step_teacher
-from recrl.teachers.teacher import TeacherSpec
+from recrl.teachers.teacher import ProgressReport, TeacherSpec
 
 # What a user's module offers under an import path.
 MINE = TeacherKind("d_t, then d_d.", NoConfig, step_teacher)
@@ -44,6 +45,30 @@ def test_every_teacher_is_made_from_its_spec(name: str) -> None:
     step, state = make_teacher(spec(name)).start()
     assert len(step.limits) == 1
     assert state["update"] == 0
+
+
+def late_step(name: str, cost: float) -> CurriculumStep:
+    """The step at 99% of the training budget, after episodes that all had the same cost."""
+    teacher = make_teacher(replace(spec(name), train_steps=10_000))
+    step, state = teacher.start()
+    for update in range(1, 100):
+        steps = 100 * update
+        finished = (steps - 90, steps - 50, steps)
+        episodes = tuple(
+            EpisodeStats(0, Phase.TRAINING, end, 40, 1.0, (cost,), step.limits, 0.0, begin_step=end - 40)
+            for end in finished
+        )
+        step, state = teacher.step(state, ProgressReport(update, steps, episodes))
+    return step
+
+
+@pytest.mark.parametrize("name", TEACHERS)
+def test_the_entry_says_what_a_teacher_does(name: str) -> None:
+    kind, unlimited = TEACHERS[name], replace(spec(name), train_limits=CostLimits.unlimited(1))
+    assert kind.measures_start == (make_teacher(unlimited).start()[0].start_limits is None)
+    assert kind.compares_costs == (late_step(name, 1.0) != late_step(name, 100.0))
+    assert kind.is_control == (late_step(name, 1.0).limits[0] >= 50.0)
+    assert kind.rewards_entropy == (late_step(name, 1.0).entropy_coefficient is not None)
 
 
 @pytest.mark.parametrize("name", TEACHERS)
