@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
-from gymnasium.spaces import Box
 from torch import Tensor, nn
 
 from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.policy_families import GaussianPolicy
 from recrl.agents.observation_features import CLIP, Encoder
 from recrl.agents.spaces import action_range
 
@@ -42,9 +42,9 @@ class PolicyModule(nn.Module):
         for name, values in constants.items():
             self.register_buffer(f"_{name}", torch.as_tensor(values).clone())
         self._num_scales, self._is_normalised = len(constants["rates"]), len(constants["mean"]) > 0
-        self._is_continuous = isinstance(policy.action_space, Box)
+        self._is_continuous = isinstance(policy, GaussianPolicy)
         log_std, middle, half = (torch.empty(0),) * 3
-        if isinstance(policy.action_space, Box):
+        if isinstance(policy, GaussianPolicy):
             middle, half = (torch.as_tensor(values).float() for values in action_range(policy.action_space))
             log_std = policy.log_std.detach().cpu() + half.log()
         for name, tensor in (("log_std", log_std), ("_middle", middle), ("_half", half)):

@@ -1,4 +1,6 @@
-"""Stochastic policies: a network with a categorical or a diagonal Gaussian head.
+"""Stochastic policies: a network whose outputs are those of a distribution over actions.
+
+``recrl.agents.building_blocks.policy_families`` has the two families, categorical and Gaussian.
 
 Acting uses NumPy, on a CPU on the parameters' own memory: at 16 observations PyTorch's overhead exceeds the
 arithmetic. Learning uses PyTorch, also for the old policy's probabilities at the start of an update. So the
@@ -9,72 +11,51 @@ Notation: U rows, B observations, n observation components, A actions, m action 
 
 from __future__ import annotations
 
-import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 from weakref import ref
 
-import gymnasium
 import numpy as np
 import numpy.typing as npt
 import torch
-from gymnasium.spaces import Discrete
 from torch import Tensor
 
-from recrl.agents.building_blocks.distributions import Categorical, Distribution, Gaussian
-from recrl.agents.building_blocks.learning_batch import find_repeated
-from recrl.agents.building_blocks.noise_scales import matching_log_std, matching_scale, off_greedy_mass
+from recrl.agents.building_blocks.distributions import Distribution
 from recrl.agents.networks.architecture import NetworkArchitecture
 from recrl.agents.networks.network_stack import make_stack
 from recrl.agents.networks.tanh_stack import Scratch, TanhStack, blocks
-from recrl.agents.spaces import action_size
 from recrl.environments.cmdp import Floats
 
-# Usual initial log standard deviation of a Gaussian policy whose actions are within [-1, 1], also that of
-# safety-starter-agents.
-INITIAL_LOG_STD = -0.5
-# float32: a log_std that was raised to its bound is this close to it.
-ROUNDING_OF_LOG_STD = 1e-6
-# Noise 1 would make a tempered Gaussian infinitely wide; this bound makes it a thousand times wider.
-SMALLEST_TEMPERING = 1e-3
 
-
-class StochasticPolicy:
-    """The policy pi(a | s): categorical for Discrete actions, diagonal Gaussian for Box.
-
-    The Gaussian's actions are in half ranges from the middle of the task's
-    (``recrl.agents.spaces.action_range``). Its log_std does not depend on the state; it is the last m of the
-    parameters.
+class StochasticPolicy(ABC):
+    """The policy pi(a | s).
 
     Args:
         num_observations: n.
-        action_space: of one environment.
+        num_outputs: of the network: A or m.
         architecture: of the network.
         last_scale: factor on the last layer's initial weights; small means nearly uniform or zero-mean.
         generator: the initialisation's randomness.
-        min_std: lower bound of a Gaussian's standard deviations, in half ranges; of m > 2 actions it is
-            times sqrt(2 / m).
+        num_spreads: parameters of the distribution that do not depend on the state, the last ones: m
+            standard deviations, or 0.
 
     Attributes:
-        action_space: of one environment.
         parameters: all of them, in one block.
         stack: the network.
-        is_categorical: whether actions are Discrete.
     """
 
     def __init__(
         self,
         num_observations: int,
-        action_space: gymnasium.Space[Any],
+        num_outputs: int,
         architecture: NetworkArchitecture,
         last_scale: float,
         generator: torch.Generator,
         *,
-        min_std: float = 0.0,
+        num_spreads: int = 0,
     ) -> None:
-        num_outputs = action_size(action_space)
-        self.action_space = action_space
-        self.is_categorical = isinstance(action_space, Discrete)
         self.parameters, self.stack = make_stack(
             architecture,
             1,
@@ -83,32 +64,82 @@ class StochasticPolicy:
             last_scale=last_scale,
             generator=generator,
             role="policy",
-            others=[] if self.is_categorical else [(num_outputs,)],
+            others=[(num_spreads,)] if num_spreads else [],
         )
-        if not self.is_categorical:
-            self.log_std.fill_(INITIAL_LOG_STD)
-        least = min_std * min(1.0, (2.0 / num_outputs) ** 0.5)
-        self._least_log_std = None if self.is_categorical or least == 0.0 else math.log(least)
-        self.bound_std()
+        self._num_layers = len(self.parameters.tensors) - (num_spreads > 0)
         self._acting = self.parameters.values.cpu()  # on a CPU the parameters themselves
-        acting = [piece.numpy() for piece in self.parameters.pieces(self._acting)]
-        self._acting_log_std = acting[-1]
+        self._acting_pieces = [piece.numpy() for piece in self.parameters.pieces(self._acting)]
         self._layers = (
-            [layer[0] for layer in acting[: len(self.stack.layers)]]
+            [layer[0] for layer in self._acting_pieces[: self._num_layers]]
             if isinstance(self.stack, TanhStack)
             else None
         )
         self._scratch: list[Scratch] = []
         self._latest: _Latest | None = None
 
+    @abstractmethod
+    def sample(
+        self, observations: npt.NDArray[np.float32], generator: np.random.Generator
+    ) -> npt.NDArray[Any]:
+        """Sample actions for B observations [B, n]: int64 [B], or float32 [B, m]."""
+
+    @abstractmethod
+    def mode(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
+        """Return the most likely actions at B observations [B, n]: int64 [B] or float32 [B, m]."""
+
+    @abstractmethod
+    def probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
+        """pi(a | s) at B observations [B, n], float64 [B, A].
+
+        Raises:
+            ValueError: actions are continuous.
+        """
+
+    @abstractmethod
+    def head(self, outputs: Tensor, spreads: Sequence[Tensor]) -> Distribution:
+        """Return the distributions of outputs, [U, A] or [U, m]; ``spreads`` as from ``spreads_of``."""
+
+    @abstractmethod
+    def add_noise(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
+        """Make the policy more random, once; see ``recrl.agents.building_blocks.noise_scales``.
+
+        Args:
+            noise: eps_pi in (0, 1].
+            observations: for measuring its randomness, [N, n].
+            form: ``match-mixture`` or ``temperature``.
+
+        Returns:
+            ``noise_scale``, the factor on the last layer (categorical) or on the mean standard deviation
+            (Gaussian). ``randomness_before`` and ``_after``, the mean off-greedy mass or the mean standard
+            deviation.
+        """
+
+    @abstractmethod
+    def bound_std(self) -> None:
+        """Raise the standard deviations to their lower bound, if the policy has one."""
+
+    @abstractmethod
+    def hold_bounded_std(self, gradients: Tensor, ascents: Tensor) -> None:
+        """Set the derivatives by a log_std to 0 if it is at its bound and an ascent would lower it.
+
+        A step that such derivatives lead would spend its KL on what ``bound_std`` takes back.
+
+        Args:
+            gradients: of any functions, [j, P]; changed in place.
+            ascents: the directions in which the step is to go, [i, P].
+        """
+
+    def spreads_of(self, pieces: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Return what does not belong to the network: the log_std [m] of a Gaussian, or nothing.
+
+        Args:
+            pieces: of the parameters, their gradients or a change of them, as ``FlatParameters`` has them.
+        """
+        return pieces[self._num_layers :]
+
     def publish(self) -> None:
         """Copy changed parameters for acting; on a CPU acting shares them."""
         self._acting.copy_(self.parameters.values)
-
-    @property
-    def log_std(self) -> Tensor:
-        """The Gaussian's log standard deviations, [m]."""
-        return self.parameters.tensors[-1]
 
     def outputs(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Logits or means of B observations, [B, n] -> [B, A] or [B, m]; no autograd."""
@@ -125,39 +156,6 @@ class StochasticPolicy:
         outputs = hidden @ self._layers[-1][:-1] + self._layers[-1][-1]
         return outputs
 
-    def sample(
-        self, observations: npt.NDArray[np.float32], generator: np.random.Generator
-    ) -> npt.NDArray[Any]:
-        """Sample actions for B observations [B, n]: int64 [B] by inversion, or float32 [B, m]."""
-        outputs = self.outputs(observations)
-        if not self.is_categorical:
-            spread = np.exp(self._acting_log_std)
-            outputs += spread * generator.standard_normal(outputs.shape, dtype=np.float32)
-            return outputs
-        cumulative = np.exp(outputs - outputs.max(axis=1, keepdims=True), dtype=np.float64).cumsum(axis=1)
-        thresholds = generator.random(len(outputs)) * cumulative[:, -1]
-        # A threshold may round up to the whole mass: then the last action is taken.
-        actions: npt.NDArray[np.int64] = (cumulative[:, :-1] <= thresholds[:, None]).sum(axis=1)
-        return actions
-
-    def mode(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[Any]:
-        """Return the most likely actions at B observations [B, n]: int64 [B] or float32 [B, m]."""
-        outputs = self.outputs(observations)
-        return outputs.argmax(axis=1) if self.is_categorical else outputs
-
-    def probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
-        """pi(a | s) at B observations [B, n], float64 [B, A].
-
-        Raises:
-            ValueError: actions are continuous.
-        """
-        if not self.is_categorical:
-            raise ValueError("continuous actions have densities, not probabilities")
-        outputs = self.outputs(observations).astype(np.float64)
-        masses = np.exp(outputs - outputs.max(axis=1, keepdims=True))
-        probabilities: Floats = masses / masses.sum(axis=1, keepdims=True)
-        return probabilities
-
     def distribution(self, rows: Tensor) -> Distribution:
         """Return the action distributions at U rows, [U, n]; not differentiable, see ``evaluate``.
 
@@ -166,8 +164,8 @@ class StochasticPolicy:
         """
         latest = self._latest
         if latest is None or not latest.is_of(rows, self.parameters.values):
-            kept = self.log_std.clone()  # the policy will change
-            distribution = self.head(self.stack.outputs(rows)[0], kept)
+            spreads = [spread.clone() for spread in self._spreads]  # the policy will change
+            distribution = self.head(self.stack.outputs(rows)[0], spreads)
             self._latest = latest = _Latest(ref(rows), self.parameters.values.clone(), distribution)
         return latest.distribution
 
@@ -183,87 +181,12 @@ class StochasticPolicy:
             activations[0][-1][0] if len(pieces) == 1 else torch.cat([each[-1][0] for each in activations])
         )
         outputs.requires_grad_()
-        leaves = [outputs]
-        if not self.is_categorical:
-            leaves.append(self.log_std.clone().requires_grad_())
-        return PolicyEvaluation(self, activations, leaves, self.head(outputs, leaves[-1]))
+        spreads = [spread.clone().requires_grad_() for spread in self._spreads]
+        return PolicyEvaluation(self, activations, [outputs, *spreads], self.head(outputs, spreads))
 
-    def head(self, outputs: Tensor, log_std: Tensor) -> Distribution:
-        """Return the distributions of outputs, [U, A] or [U, m]; only a Gaussian has a log_std."""
-        if self.is_categorical:
-            return Categorical(torch.log_softmax(outputs, dim=1))
-        return Gaussian(outputs, log_std)
-
-    def add_noise(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
-        """Make the policy more random, once; see ``recrl.agents.building_blocks.noise_scales``.
-
-        Args:
-            noise: eps_pi in (0, 1].
-            observations: for measuring its randomness, [N, n].
-            form: ``match-mixture`` or ``temperature``.
-
-        Returns:
-            ``noise_scale``, the factor on the last layer (categorical) or on the mean standard deviation
-            (Gaussian). ``randomness_before`` and ``_after``, the mean off-greedy mass or the mean standard
-            deviation.
-        """
-        if self.is_categorical:
-            return self._soften(noise, observations, form)
-        return self._widen(noise, form)
-
-    def bound_std(self) -> None:
-        """Raise a Gaussian's standard deviations to their lower bound.
-
-        With two actions or more, the noise then has a mean squared length of at least 2 min_std^2 squared
-        half ranges, however many there are.
-        """
-        if self._least_log_std is not None:
-            self.log_std.clamp_(min=self._least_log_std)
-
-    def hold_bounded_std(self, gradients: Tensor, ascents: Tensor) -> None:
-        """Set the derivatives by a log_std to 0 if it is at its bound and an ascent would lower it.
-
-        A step that such derivatives lead would spend its KL on what ``bound_std`` takes back.
-
-        Args:
-            gradients: of any functions, [j, P]; changed in place.
-            ascents: the directions in which the step is to go, [i, P].
-        """
-        if self._least_log_std is None:
-            return
-        num = self.log_std.numel()
-        at_bound = self.log_std <= self._least_log_std + ROUNDING_OF_LOG_STD
-        held = at_bound & (ascents[:, -num:] < 0.0).any(dim=0)
-        gradients[:, -num:].masked_fill_(held, 0.0)
-
-    def _soften(self, noise: float, observations: npt.NDArray[np.float32], form: str) -> dict[str, float]:
-        distinct = find_repeated(observations)
-        weights = np.full(len(observations), 1.0 / len(observations))
-        if distinct is not None:  # on a tabular task a sixteenth of the rows
-            first, row = distinct
-            observations, weights = observations[first], np.bincount(row) / len(observations)
-        logits = self.outputs(observations).astype(np.float64)
-        scale = 1.0 - noise if form == "temperature" else matching_scale(logits, weights, noise)
-        self.stack.scale(torch.tensor(scale))
-        return {
-            "noise_scale": scale,
-            "randomness_before": off_greedy_mass(logits, weights),
-            "randomness_after": off_greedy_mass(scale * logits, weights),
-        }
-
-    def _widen(self, noise: float, form: str) -> dict[str, float]:
-        before = self._acting_log_std.astype(np.float64)
-        if form == "temperature":
-            after = before - np.log(max(1.0 - noise, SMALLEST_TEMPERING))
-        else:
-            after = matching_log_std(before, noise)
-        self.log_std.copy_(torch.as_tensor(after))
-        mean_before, mean_after = float(np.exp(before).mean()), float(np.exp(after).mean())
-        return {
-            "noise_scale": mean_after / mean_before,
-            "randomness_before": mean_before,
-            "randomness_after": mean_after,
-        }
+    @property
+    def _spreads(self) -> Sequence[Tensor]:
+        return self.spreads_of(self.parameters.tensors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,44 +232,7 @@ class PolicyEvaluation:
         slopes = torch.autograd.grad(loss, self.leaves, retain_graph=retain_graph)
         for block, activations in zip(blocks(len(slopes[0])), self.activations, strict=True):
             self.policy.stack.pull_back(activations, slopes[0][None, block], add=block.start > 0)
-        if len(slopes) > 1:
-            self.policy.parameters.gradients[-1].copy_(slopes[1])
-        return self.policy.parameters.gradient
-
-
-class FisherMetric:
-    """The metric of the trust region: the Hessian of the mean KL at the present parameters, plus damping.
-
-    H v = J^T F J v + damping v, with J the Jacobian of the network's outputs and F the Fisher metric on
-    them, averaged over the samples. At the parameters that collected the samples this *is* the Hessian of the
-    mean KL: the missing term is proportional to the gradient of the KL, which is 0 there. A product takes one
-    forward and one backward sweep, a third of the time of double differentiation.
-
-    Args:
-        policy: at the parameters of the metric; they must not change while it is used.
-        rows: the distinct observations, [U, n].
-        observation_weights: fraction of the samples at each row, [U], summing to 1.
-        damping: multiple of the identity added, at least 0.
-    """
-
-    def __init__(
-        self, policy: StochasticPolicy, rows: Tensor, observation_weights: Tensor, damping: float
-    ) -> None:
-        self._policy = policy
-        self._damping = damping
-        self._blocks: list[tuple[list[Tensor], Distribution, Tensor]] = []
-        for block in blocks(len(rows)):
-            activations = policy.stack.activations(rows[block], Scratch())
-            distribution = policy.head(activations[-1][0], policy.log_std)
-            self._blocks.append((activations, distribution, observation_weights[block, None]))
-
-    def __call__(self, vector: Tensor) -> Tensor:
-        """Return H times a vector of parameter changes, [P] -> [P]; overwrites the gradient block."""
-        stack, parameters = self._policy.stack, self._policy.parameters
-        change = parameters.pieces(vector)
-        for number, (activations, distribution, weights) in enumerate(self._blocks):
-            moved = stack.output_change(activations, change)[0]
-            stack.pull_back(activations, (weights * distribution.fisher(moved))[None], add=number > 0)
-        if not self._policy.is_categorical:
-            parameters.gradients[-1].copy_(2.0 * change[-1])  # the Fisher metric of log_std is 2
-        return parameters.gradient + self._damping * vector
+        parameters = self.policy.parameters
+        for gradient, slope in zip(self.policy.spreads_of(parameters.gradients), slopes[1:], strict=True):
+            gradient.copy_(slope)
+        return parameters.gradient

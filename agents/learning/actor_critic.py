@@ -28,6 +28,7 @@ from recrl.agents.building_blocks.advantages import generalised_advantages, next
 from recrl.agents.building_blocks.critics import Critics
 from recrl.agents.building_blocks.learning_batch import LearningBatch
 from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.policy_families import make_policy
 from recrl.agents.building_blocks.scales import RunningScale, quotient
 from recrl.agents.constraints.cost_measures import MeanCost, RecentEpisodes, TailCost
 from recrl.agents.errors import require_finite
@@ -307,7 +308,7 @@ def fresh_agent(
     def first_policy() -> tuple[StochasticPolicy, torch.Generator]:
         """Make the policy before the first update; return the generator for further networks, too."""
         generator = torch.Generator().manual_seed(int(seed.generate_state(1, np.uint64)[0] >> 1))
-        made = StochasticPolicy(
+        made = make_policy(
             encoder.size,
             cmdp.action_space,
             architecture,

@@ -19,13 +19,14 @@ from torch import Tensor
 
 from recrl.agents.building_blocks.distributions import Distribution, mean_divergence
 from recrl.agents.building_blocks.learning_batch import to_tensor
-from recrl.agents.building_blocks.policies import FisherMetric, StochasticPolicy
+from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.building_blocks.surrogates import surrogate
 from recrl.agents.errors import require_finite
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.agents.shared_options import TrustRegionConfig
 from recrl.agents.trust_region.conjugate_gradient import conjugate_gradient
 from recrl.agents.trust_region.cpo_dual import DualSolution, StepProblem
+from recrl.agents.trust_region.fisher_metric import FisherMetric
 from recrl.environments.cmdp import Floats
 
 

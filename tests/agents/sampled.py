@@ -8,6 +8,7 @@ from gymnasium.spaces import Space
 
 from recrl.agents.building_blocks.learning_batch import LearningBatch
 from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.policy_families import make_policy
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.environments.cmdp import Floats
 
@@ -17,7 +18,7 @@ NUM_SAMPLES = 400
 def sampled(space: Space[object]) -> tuple[StochasticPolicy, LearningBatch, Floats]:
     """A policy, what it did, and advantages: the reward likes what the first cost dislikes."""
     generator = np.random.default_rng(0)
-    policy = StochasticPolicy(
+    policy = make_policy(
         3, space, NetworkArchitecture((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0)
     )
     observations = generator.normal(size=(NUM_SAMPLES, 3)).astype(np.float32)

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box, Discrete, Space
 from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation, acceptance
 from recrl.agents.algorithms.own_options import CPOConfig
 from recrl.agents.algorithms.pcpo import projected_step
-from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.policy_families import make_policy
 from recrl.agents.experience import ActiveConstraints, Constraints, Experience
 from recrl.agents.learning.policy_rule import improve_and_measure
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
@@ -40,7 +40,7 @@ def improve(
     rule = ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA, violation_integral_gain=0.0), 2)
     experience = Experience.of(policy, batch, advantages, constraints)
     metrics = improve_and_measure(rule, policy, experience, np.random.default_rng(0))
-    old = StochasticPolicy(
+    old = make_policy(
         3, space, NetworkArchitecture((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0)
     )
     rows = batch.unique_observations

@@ -19,7 +19,7 @@ from recrl.agents.algorithms.own_options import FOCOPSConfig, IPOConfig, P3OConf
 from recrl.agents.algorithms.p3o import PenalisedProximalPolicyOptimisation, penalised_surrogate_objective
 from recrl.agents.building_blocks.distributions import Categorical
 from recrl.agents.building_blocks.learning_batch import LearningBatch
-from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.policy_families import make_policy
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
@@ -124,7 +124,7 @@ def test_focops_weighs_what_is_gained_against_how_far_the_policy_moves() -> None
 def test_the_trust_region_is_kept_however_long_a_step_is(agent: str) -> None:
     found = {}
     for name in ("kept", "passed"):
-        policy = StochasticPolicy(
+        policy = make_policy(
             3, Discrete(2), NetworkArchitecture((8,), orthogonal), 1.0, torch.Generator().manual_seed(0)
         )
         constraints = Constraints(np.array([math.inf]), np.array([-math.inf]), np.zeros(1), 10.0)
@@ -143,7 +143,7 @@ def test_the_trust_region_is_kept_however_long_a_step_is(agent: str) -> None:
 def improved(name: str, gap: float, limit: float = 5.0) -> tuple[dict[str, float], bool]:
     """The metrics of one update, and whether the policy is another."""
     generator = torch.Generator().manual_seed(0)
-    policy = StochasticPolicy(3, Discrete(2), NetworkArchitecture((8,), orthogonal), 1.0, generator)
+    policy = make_policy(3, Discrete(2), NetworkArchitecture((8,), orthogonal), 1.0, generator)
     before = policy.parameters.to_numpy()
     rules: dict[str, PolicyRule] = {
         "focops": FirstOrderConstrainedOptimisation(FOCOPSConfig(), policy, 1),

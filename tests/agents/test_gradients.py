@@ -17,6 +17,7 @@ from recrl.agents.building_blocks.critics import Critics
 from recrl.agents.building_blocks.distributions import Distribution
 from recrl.agents.building_blocks.learning_batch import LearningBatch
 from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.policy_families import make_policy
 from recrl.agents.building_blocks.surrogates import SignedAdvantages, clipped_surrogate, surrogate
 from recrl.agents.constraints.relative_units import RelativeConstraints, RelativeUnits
 from recrl.agents.experience import Constraints, Experience
@@ -38,7 +39,7 @@ pytestmark = pytest.mark.usefixtures("double_precision")
 def moved_policy(space: Space[object], compact: bool) -> tuple[StochasticPolicy, Experience]:
     """A policy that has moved so far that some ratios are clipped, and what it was before."""
     generator = np.random.default_rng(0)
-    policy = StochasticPolicy(3, space, FORM, 1.0, torch.Generator().manual_seed(0))
+    policy = make_policy(3, space, FORM, 1.0, torch.Generator().manual_seed(0))
     observations = generator.normal(size=(8, 3))[generator.integers(8, size=30)]
     actions = policy.sample(observations, generator)  # type: ignore[arg-type]
     batch = LearningBatch.deduplicate(observations, actions, compact=compact)  # type: ignore[arg-type]

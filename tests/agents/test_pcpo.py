@@ -20,7 +20,7 @@ from recrl.agents.algorithms.own_options import CRPOConfig, PCPOConfig, TRPOLagC
 from recrl.agents.algorithms.pcpo import projected_step
 from recrl.agents.algorithms.trpo_lag import TRPOLagrangian
 from recrl.agents.building_blocks.learning_batch import LearningBatch
-from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.policy_families import make_policy
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
@@ -145,7 +145,7 @@ def improved(
 ) -> tuple[dict[str, float], Floats]:
     """The metrics of one update, and how the policy's parameters have changed."""
     generator = np.random.default_rng(0)
-    policy = StochasticPolicy(
+    policy = make_policy(
         3, space, NetworkArchitecture((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0)
     )
     observations = generator.normal(size=(400, 3)).astype(np.float32)

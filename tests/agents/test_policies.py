@@ -8,9 +8,11 @@ from torch import Tensor
 
 from recrl.agents.building_blocks.distributions import Categorical, Gaussian, mean_divergence
 from recrl.agents.building_blocks.noise_scales import matching_log_std, matching_scale, off_greedy_mass
-from recrl.agents.building_blocks.policies import FisherMetric, StochasticPolicy
+from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.policy_families import GaussianPolicy, make_policy
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.agents.networks.tanh_stack import TanhStack
+from recrl.agents.trust_region.fisher_metric import FisherMetric
 
 FORM = NetworkArchitecture((5, 4), orthogonal)
 THREE_ACTIONS = Discrete(3)
@@ -19,7 +21,7 @@ SPACES = [THREE_ACTIONS, TWO_COMPONENTS]
 
 
 def policy_for(space: Space[object], last_scale: float = 1.0) -> StochasticPolicy:
-    return StochasticPolicy(3, space, FORM, last_scale, torch.Generator().manual_seed(0))
+    return make_policy(3, space, FORM, last_scale, torch.Generator().manual_seed(0))
 
 
 def random_rows(count: int = 6) -> Tensor:
@@ -188,7 +190,7 @@ def test_gaussian_noise_of_many_components_is_as_long_as_that_of_two() -> None:
 @pytest.mark.parametrize("form", ["match-mixture", "temperature"])
 def test_noise_makes_a_policy_more_random(space: Space[object], form: str) -> None:
     policy, rows = policy_for(space, last_scale=5.0), random_rows()
-    if space is TWO_COMPONENTS:
+    if isinstance(policy, GaussianPolicy):
         policy.log_std.fill_(-3.0)
     before = float(policy.distribution(rows).entropy().mean())
     metrics = policy.add_noise(0.3, rows.numpy(), form)
@@ -199,14 +201,15 @@ def test_noise_makes_a_policy_more_random(space: Space[object], form: str) -> No
 
 def test_the_strongest_noise_is_that_of_uniform_actions() -> None:
     policy = policy_for(TWO_COMPONENTS)
+    assert isinstance(policy, GaussianPolicy)
     policy.log_std.fill_(-5.0)
     policy.add_noise(1.0, random_rows().numpy(), "match-mixture")
     assert policy.log_std.exp().tolist() == pytest.approx([3.0**-0.5] * 2)
 
 
-def bounded_policy(stds: list[float]) -> StochasticPolicy:
+def bounded_policy(stds: list[float]) -> GaussianPolicy:
     space = Box(-1.0, 1.0, (len(stds),))
-    policy = StochasticPolicy(3, space, FORM, 1.0, torch.Generator().manual_seed(0), min_std=0.5)
+    policy = GaussianPolicy(3, space, FORM, 1.0, torch.Generator().manual_seed(0), min_std=0.5)
     policy.log_std.copy_(torch.log(torch.tensor(stds)))
     return policy
 

@@ -12,6 +12,7 @@ from recrl.agents.algorithms.ppo_lag import SURROGATE_OBJECTIVES, PPOLagrangian
 from recrl.agents.building_blocks.advantages import standardised_rewards
 from recrl.agents.building_blocks.learning_batch import LearningBatch
 from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.policy_families import make_policy
 from recrl.agents.constraints.cost_measures import MeasuredCosts
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.policy_rule import improve_and_measure
@@ -29,7 +30,7 @@ def measured(gap: float, limit: float = 5.0) -> Constraints:
 
 def fresh(**options: object) -> tuple[StochasticPolicy, PPOLagrangian, LearningBatch]:
     generator = torch.Generator().manual_seed(0)
-    policy = StochasticPolicy(3, Discrete(2), NetworkArchitecture((8,), orthogonal), 1.0, generator)
+    policy = make_policy(3, Discrete(2), NetworkArchitecture((8,), orthogonal), 1.0, generator)
     rule = PPOLagrangian(PPOLagConfig.model_validate(options), policy, 1)
     return policy, rule, LearningBatch.deduplicate(np.eye(3, dtype=np.float32)[STATES], ACTIONS, compact=True)
 

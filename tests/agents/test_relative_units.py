@@ -8,7 +8,7 @@ import torch
 from gymnasium.spaces import Discrete
 
 from recrl.agents.building_blocks.learning_batch import LearningBatch
-from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.policy_families import make_policy
 from recrl.agents.constraints.relative_units import RelativeConstraints, RelativeUnits
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
@@ -39,7 +39,7 @@ def test_two_rollouts_by_hand() -> None:
 
 
 def constraints_of(limits: Floats, gaps: Floats) -> RelativeConstraints:
-    policy = StochasticPolicy(1, Discrete(2), NetworkArchitecture((2,), orthogonal), 1.0, torch.Generator())
+    policy = make_policy(1, Discrete(2), NetworkArchitecture((2,), orthogonal), 1.0, torch.Generator())
     batch = LearningBatch.deduplicate(np.zeros((2, 1), np.float32), np.array([0, 1]), compact=False)
     constraints = Constraints(limits, gaps, np.zeros(3), 10.0)
     return RelativeConstraints.of(Experience.of(policy, batch, ADVANTAGES, constraints), RelativeUnits(3))

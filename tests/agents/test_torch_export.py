@@ -7,7 +7,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 
-from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.policy_families import GaussianPolicy, make_policy
 from recrl.agents.networks.architecture import INITIALISERS, NetworkArchitecture
 from recrl.agents.networks.module_stack import perceptron
 from recrl.agents.observation_features import Encoder
@@ -35,14 +35,14 @@ def test_a_module_computes_what_the_agent_does(space: Any, own: bool, normalise:
     encoder.learn(observations(50))
     generator = torch.Generator().manual_seed(0)
     factory = perceptron([8], "relu", INITIALISER)(generator) if own else None
-    policy = StochasticPolicy(
+    policy = make_policy(
         encoder.size, space, NetworkArchitecture((8, 8), INITIALISER, "tanh", factory), 0.5, generator
     )
     module = PolicyModule(encoder, policy)
     rows = observations()
     inputs = torch.as_tensor(rows)
     expected, log_std = policy.outputs(encoder(rows)), np.empty(0)
-    if isinstance(space, Box):
+    if isinstance(policy, GaussianPolicy):
         expected = [0.0, 15.0] + np.array([1.0, 5.0]) * expected
         log_std = policy.log_std.numpy() + np.log([1.0, 5.0])
     np.testing.assert_allclose(module(inputs).detach().numpy(), expected, rtol=1e-5, atol=1e-6)

@@ -8,7 +8,7 @@ import torch
 from gymnasium.spaces import Box
 
 from recrl.agents.algorithms.own_options import TRPOConfig
-from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.policy_families import GaussianPolicy
 from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.agents.networks.flat_parameters import FlatParameters
 from recrl.agents.trust_region.conjugate_gradient import conjugate_gradient
@@ -76,7 +76,7 @@ def test_a_step_is_projected_before_it_is_checked() -> None:
 
 
 def test_the_line_search_checks_policies_with_their_standard_deviations_at_the_bound() -> None:
-    policy = StochasticPolicy(
+    policy = GaussianPolicy(
         3, Box(-1.0, 1.0, (2,)), NetworkArchitecture((4,), orthogonal), 1.0, torch.Generator(), min_std=0.5
     )
     step, checked = torch.zeros_like(policy.parameters.values), []

@@ -33,7 +33,7 @@ from gymnasium.spaces import Box
 from recrl.agents.agent import Rollout
 from recrl.agents.building_blocks.critics import Critics
 from recrl.agents.building_blocks.learning_batch import find_repeated
-from recrl.agents.building_blocks.policies import StochasticPolicy
+from recrl.agents.building_blocks.policy_families import make_policy
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.networks.architecture import NetworkArchitecture, xavier
 from recrl.agents.networks.flat_parameters import Adam
@@ -196,7 +196,7 @@ def passes_in_turn(samples: int, rounds: int) -> dict[str, list[float]]:
     form = NetworkArchitecture(HIDDEN, xavier)
     critics = Critics(NUM_OBSERVATIONS, 1, form, generator)
     actions = Box(-1.0, 1.0, (NUM_ACTIONS,), np.float32)
-    policy = StochasticPolicy(NUM_OBSERVATIONS, actions, form, 1.0, generator)
+    policy = make_policy(NUM_OBSERVATIONS, actions, form, 1.0, generator)
     rows = torch.randn(samples, NUM_OBSERVATIONS, generator=generator)
     targets = torch.randn(2, samples, generator=generator)
     shares = torch.full((samples,), 1.0 / samples)
