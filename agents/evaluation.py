@@ -80,7 +80,8 @@ def evaluate(
         ``num_episodes`` episodes, environment by environment.
 
     Raises:
-        RuntimeError: environments with a share left finish none in ``MAX_STEPS`` steps.
+        RuntimeError: environments with a share left finish none in ``MAX_STEPS`` steps, nor in twice the
+            task's horizon.
         StoppedError: see ``should_stop``.
     """
     environment_seed, policy_seed = _spawned(seed)
@@ -90,13 +91,13 @@ def evaluate(
     whole, rest = divmod(num_episodes, environments.num_envs)
     shares = [whole + (index < rest) for index in range(environments.num_envs)]
     done: list[list[FinishedEpisode]] = [[] for _ in shares]
-    steps = 0
+    steps, most_steps = 0, max(MAX_STEPS, 2 * (environments.cmdp.horizon or 0))
     while any(len(episodes) < share for episodes, share in zip(done, shares, strict=True)):
         if should_stop():
             raise StoppedError
-        if steps >= MAX_STEPS:
+        if steps >= most_steps:
             raise RuntimeError(
-                f"evaluation: no episode ended in {MAX_STEPS:,} steps of an environment; the task must "
+                f"evaluation: no episode ended in {most_steps:,} steps of an environment; the task must "
                 "return terminated or truncated at some time (gymnasium.wrappers.TimeLimit does)"
             )
         _, finished = collector.collect(EvaluatedPolicy(actor, policy), generator)

@@ -38,8 +38,8 @@ class TeacherKind:
         make: builds it, from options that ``config`` has accepted.
         measures_start: whether it measures an infinite d_t, as a mean cost, as ``StartMeasurement`` does.
         compares_costs: whether it compares mean costs of episodes with its limits.
-        rewards_entropy: whether its steps have an entropy coefficient. It is then refused for continuous
-            actions, because the entropy of a Gaussian policy has no bound.
+        rewards_entropy: whether its steps may have an entropy coefficient. It is then refused for
+            continuous actions, because the entropy of a Gaussian policy has no bound.
         is_control: whether it keeps d_t until the deployment phase, so that a hard landing is no mistake.
     """
 
@@ -118,7 +118,10 @@ def may_measure_start(name: str) -> bool:
 
 
 def is_known_control(name: str) -> bool:
-    """Return whether a curriculum is one of this package's that keep d_t until the deployment phase."""
+    """Return whether a curriculum is one of this package's that keep d_t until the deployment phase.
+
+    Their trials had the event of a hard landing before curricula declared ``is_control``.
+    """
     return name in TEACHERS and TEACHERS[name].is_control
 
 

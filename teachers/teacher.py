@@ -103,7 +103,7 @@ def checked_answer(answer: object, curriculum: str, num_costs: int) -> tuple[Cur
     Raises:
         TypeError: it is not a pair of a CurriculumStep and a mapping, or the mapping has other values than
             JSON.
-        ValueError: the number of its limits is not that of the costs.
+        ValueError: the number of its limits, or start limits, is not that of the costs.
     """
     match answer:
         case (CurriculumStep() as step, Mapping() as state):
@@ -111,6 +111,11 @@ def checked_answer(answer: object, curriculum: str, num_costs: int) -> tuple[Cur
                 raise ValueError(
                     f"curriculum {curriculum}: a step must have one limit per cost, {num_costs}, "
                     f"got {len(step.limits)}"
+                )
+            if step.start_limits is not None and len(step.start_limits) != num_costs:
+                raise ValueError(
+                    f"curriculum {curriculum}: start_limits must be None or one limit per cost, {num_costs}, "
+                    f"got {len(step.start_limits)}"
                 )
             if problem := _not_json(dict(state), "state"):
                 raise TypeError(f"curriculum {curriculum}: {problem}; a state holds JSON values only")

@@ -154,6 +154,7 @@ class GaussianPolicy(StochasticPolicy):
         least = min_std * min(1.0, (2.0 / num_components) ** 0.5)
         self._least_log_std = math.log(least) if least else -math.inf
         self.bound_std()
+        self.publish()
         self._acting_log_std = self._acting_pieces[-1]
 
     @property

@@ -1,6 +1,6 @@
 """Conjugate gradients: the product of an inverse metric and a gradient.
 
-Notation: P parameters, H the metric (``recrl.agents.building_blocks.policies.FisherMetric``).
+Notation: P parameters, H the metric (``recrl.agents.trust_region.fisher_metric.FisherMetric``).
 """
 
 from __future__ import annotations

@@ -11,8 +11,9 @@ import numpy as np
 
 from recrl.orchestrator.errors import RowError
 
-# Columns of some trials: of tasks with more costs, and of curricula that reward entropy.
-_RESERVED = re.compile(r"(cost|limit)_\d+|entropy_coefficient")
+# Columns of some trials: of tasks with more costs, and of curricula that reward entropy. Tables of a sweep
+# add which trial a row is from.
+_RESERVED = re.compile(r"(cost|limit)_\d+|entropy_coefficient|trial|task|agent|method|seed")
 _EVENT_KEYS = ("update", "end_step", "event", "policy_noise")
 
 
@@ -66,7 +67,9 @@ def _numbers(agent: str, method: str, kind: str, values: object) -> Mapping[str,
 
 
 def _is_number(value: object) -> bool:
-    """Whether a value is a real number that is finite as a float, or NaN."""
+    """Whether a value is a real number that is finite as a float, or NaN; True and False are not."""
+    if isinstance(value, bool):
+        return False
     try:
         return isinstance(value, int | float | np.integer | np.floating) and not math.isinf(value)
     except OverflowError:

@@ -37,6 +37,7 @@ from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.agent_answers import checked_metrics, checked_noise
 from recrl.orchestrator.trial.rollout_check import check_rollout
+from recrl.teachers.registry import find_teacher
 from recrl.teachers.teacher import (
     ProgressReport,
     Teacher,
@@ -91,6 +92,7 @@ class Trial:
         self.spec = spec
         self._writer = writer
         self._teacher = teacher
+        self._curriculum = find_teacher(spec.method.name)
         seeds = TrialSeeds.of(spec)
         self._evaluation_seed = seeds.evaluation
         self._generator = np.random.default_rng(seeds.exploration)
@@ -150,7 +152,7 @@ class Trial:
             "update_seconds": round(time.process_time() - clock, 6),
             **{f"cost_{i}": _mean(costs[:, i]) for i in range(self._cmdp.num_costs)},
             **{f"limit_{i}": limit for i, limit in enumerate(step.limits)},
-            **_entropy_coefficient(step),
+            **self._entropy_coefficient(step),
         }
         self._writer.append_update({**row, **checked_metrics(self.spec.agent.label, metrics, row)})
         if self.update % max(1, self.spec.num_updates // LOGGED_UPDATES) == 0 or self.learned:
@@ -244,6 +246,11 @@ class Trial:
         """Check the curriculum's answer; ``before`` has the limits before it, None at the start."""
         label = self.spec.method.label
         step, state = checked_answer(answer, label, self._cmdp.num_costs)
+        if step.entropy_coefficient is not None and not self._curriculum.rewards_entropy:
+            raise TypeError(
+                f"curriculum {label}: a step has an entropy_coefficient, so its TeacherKind must have "
+                "rewards_entropy=True"
+            )
         check_limits_fall(
             step,
             before,
@@ -255,8 +262,18 @@ class Trial:
         )
         return step, state
 
+    def _entropy_coefficient(self, step: CurriculumStep) -> dict[str, float]:
+        """Return the column of the entropy coefficient; empty if the curriculum never rewards entropy."""
+        return (
+            {"entropy_coefficient": step.entropy_coefficient or 0.0}
+            if self._curriculum.rewards_entropy
+            else {}
+        )
+
     def _warn_of_hard_landing(self) -> None:
-        """Record an event if deployment begins with limits far below the last training limits."""
+        """Record an event if deployment begins with limits far below the last ones, unless it has to."""
+        if self._curriculum.is_control:
+            return
         before, after = self._step.limits, self.spec.deploy_limits
         start = self._step.start_limits or self.spec.train_limits
         if any(
@@ -379,11 +396,6 @@ def policy_table(policy: FinalPolicy, environments: CMDPVectorEnv) -> list[dict[
         return []
     probabilities = policy.action_probabilities(environments.observations)
     return [{f"action_{j}": float(share) for j, share in enumerate(row)} for row in probabilities]
-
-
-def _entropy_coefficient(step: CurriculumStep) -> dict[str, float]:
-    """Return the column of the entropy coefficient; empty if the curriculum never rewards entropy."""
-    return {} if step.entropy_coefficient is None else {"entropy_coefficient": step.entropy_coefficient}
 
 
 def _mean(values: Sequence[float] | Floats) -> float:

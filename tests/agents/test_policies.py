@@ -234,6 +234,17 @@ def test_a_standard_deviation_at_its_bound_is_held_if_an_ascent_would_lower_it()
 
 
 @pytest.mark.parametrize("space", SPACES)
+def test_a_new_policy_acts_as_it_learns_where_acting_uses_a_copy(
+    space: Space[object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows, expected = random_rows().numpy(), policy_for(space)
+    monkeypatch.setattr(Tensor, "cpu", Tensor.clone)  # as on a GPU
+    found = policy_for(space)
+    first, second = (each.sample(rows, np.random.default_rng(1)) for each in (expected, found))
+    np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("space", SPACES)
 def test_without_a_bound_the_parameters_stay(space: Space[object]) -> None:
     policy = policy_for(space)
     before = policy.parameters.to_numpy()

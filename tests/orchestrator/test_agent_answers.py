@@ -17,7 +17,10 @@ def test_metrics_may_be_any_numbers() -> None:
     assert checked_metrics("own", metrics, {"update", "cost_0"}) == metrics
 
 
-@pytest.mark.parametrize("name", ["update", "cost_0", "cost_1", "limit_12", "entropy_coefficient"])
+@pytest.mark.parametrize(
+    "name",
+    ["update", "cost_0", "cost_1", "limit_12", "entropy_coefficient", "trial", "task", "method", "seed"],
+)
 def test_metrics_do_not_take_the_names_of_columns_of_this_or_another_trial(name: str) -> None:
     with pytest.raises(RowError, match=rf"^agent own: its metrics must have other names .* got {name}$"):
         checked_metrics("own", {name: 1.0}, {"update", "cost_0"})
@@ -33,6 +36,7 @@ def test_what_noise_changed_is_written_as_json() -> None:
     [
         (None, "agent own: add_noise must return a mapping of numbers, got None"),
         ({"scale": "large"}, "agent own: number scale must be a finite number or NaN, got 'large'"),
+        ({"scale": True}, "agent own: number scale must be a finite number or NaN, got True"),
         ({"scale": np.complex64(1j)}, "agent own: number scale must be a finite number or NaN, got "),
         ({"scale": 10**400}, "agent own: number scale must be a finite number or NaN, got 1000"),
         ({"scale": math.nan}, "agent own: number scale of add_noise must be finite, got nan"),

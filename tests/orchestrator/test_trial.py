@@ -30,7 +30,8 @@ from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
 from recrl.orchestrator.trial import trial
 from recrl.orchestrator.trial.attempt import run_recorded
 from recrl.orchestrator.trial.trial import Trial
-from recrl.teachers.registry import TEACHERS, make_teacher
+from recrl.teachers.registry import TEACHERS, TeacherKind, make_teacher
+from recrl.teachers.static import NoConfig, step_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 
 SMALL = {"hidden_sizes": [16]}
@@ -221,11 +222,17 @@ def test_limits_start_where_the_teacher_measured_and_never_rise(undisturbed: Tri
     assert [event["event"] for event in undisturbed.events()] == ["start limits measured"]
 
 
-def test_a_limit_that_falls_at_once_when_training_ends_is_an_event(tmp_path: Path) -> None:
-    store = run(tmp_path, replace(SPEC, method=Choice("step"), train_limits=CostLimits((50.0,))))
-    (event,) = store.events()
+def test_a_limit_that_falls_at_once_when_training_ends_is_an_event(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kind = TeacherKind("d_t, then d_d.", NoConfig, step_teacher)
+    monkeypatch.setitem(TEACHERS, "mine", kind)
+    own = replace(SPEC, method=Choice("mine"), train_limits=CostLimits((50.0,)))
+    (event,) = run(tmp_path, own).events()
     assert event["event"] == "hard landing"
     assert (event["limits"], event["deploy_limits"]) == ([50.0], SPEC.deploy_limits.to_json())
+    monkeypatch.setitem(TEACHERS, "mine", replace(kind, is_control=True))
+    assert run(tmp_path / "control", own).events() == []
     assert run(tmp_path / "soft", replace(SPEC, method=Choice("none"))).events() == []
     # a limit that falls steadily is a little above d_d in the last update
     linear = run(
@@ -323,14 +330,39 @@ class Rising:
         return CurriculumStep(CostLimits((limit,))), {"update": report.update}
 
 
-def test_a_limit_that_rises_fails_the_trial(tmp_path: Path) -> None:
-    spec = replace(SPEC, method=Choice("mine:RISING", label="rising"))
+def test_a_limit_that_rises_fails_the_trial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(TEACHERS, "mine", TeacherKind("9, then 12.", NoConfig, lambda _: Rising()))
+    spec = replace(SPEC, method=Choice("mine", label="rising"))
     store = SweepStore(tmp_path, "sweep").trial(spec)
-    assert run_recorded(spec, store, should_stop=never, teacher=Rising()) is TrialStatus.FAILED
+    assert run_recorded(spec, store, should_stop=never) is TrialStatus.FAILED
     assert store.record().error == (
         "ValueError: curriculum rising: the limit of wear rose from 9 to 12 after update 2; limits may only "
         "fall (in update 2; no checkpoint before it)"
     )
+
+
+class Warming(Rising):
+    """A curriculum of the user's own that rewards entropy only after update 2."""
+
+    def step(self, state: TeacherState, report: ProgressReport) -> tuple[CurriculumStep, TeacherState]:
+        coefficient = None if report.update < 2 else 0.5
+        return CurriculumStep(CostLimits((9.0,)), 0.0, coefficient), {"update": report.update}
+
+
+def test_a_curriculum_that_rewards_entropy_declares_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kind = TeacherKind("Entropy from update 3 on.", NoConfig, lambda _: Warming())
+    spec = replace(SPEC, method=Choice("mine"), train_steps=4 * 60)
+    monkeypatch.setitem(TEACHERS, "mine", kind)
+    store = SweepStore(tmp_path, "sweep").trial(spec)
+    assert run_recorded(spec, store, should_stop=never) is TrialStatus.FAILED
+    assert store.record().error.startswith(
+        "TypeError: curriculum mine: a step has an entropy_coefficient, so its TeacherKind must have "
+        "rewards_entropy=True"
+    )
+    monkeypatch.setitem(TEACHERS, "mine", replace(kind, rewards_entropy=True))
+    assert run(tmp_path / "declared", spec).updates()["entropy_coefficient"].tolist() == [0, 0, 0.5, 0.5, 0]
 
 
 def test_an_agent_whose_entropy_cannot_be_rewarded_is_named(

@@ -304,6 +304,10 @@ STATE: dict[str, Any] = {"update": 0}
         ((CostLimits((1.0,)), STATE), "a CurriculumStep and its state, a mapping, got CostLimits, dict"),
         ((CurriculumStep(CostLimits((1.0,))), None), "a mapping, got CurriculumStep, NoneType"),
         ((CurriculumStep(CostLimits((1.0, 2.0))), STATE), "a step must have one limit per cost, 1, got 2"),
+        (
+            (CurriculumStep(CostLimits((1.0,)), start_limits=CostLimits((9.0, 9.0))), STATE),
+            "curriculum mine: start_limits must be None or one limit per cost, 1, got 2",
+        ),
     ],
 )
 def test_what_is_wrong_with_a_curriculums_answer_is_said(answer: object, sentence: str) -> None:
