@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from typing import Any
 
@@ -37,19 +37,22 @@ class TeacherKind:
         config: the pydantic model of its options.
         make: builds it, from options that ``config`` has accepted.
         measures_start: whether it measures an infinite d_t, as a mean cost, as ``StartMeasurement`` does.
+            Otherwise ``start_limits`` that come after the first step are an error.
         compares_costs: whether it compares mean costs of episodes with its limits.
-        rewards_entropy: whether its steps may have an entropy coefficient. It is then refused for
-            continuous actions, because the entropy of a Gaussian policy has no bound.
+        rewards_entropy: whether its steps may have an entropy coefficient; otherwise such a step is an
+            error. A curriculum that rewards entropy is refused for continuous actions, because the entropy
+            of a Gaussian policy has no bound.
         is_control: whether it keeps d_t until the deployment phase, so that a hard landing is no mistake.
     """
 
     summary: str
     config: type[BaseModel]
     make: Callable[[TeacherSpec], Teacher]
-    measures_start: bool = field(default=False, kw_only=True)
-    compares_costs: bool = field(default=False, kw_only=True)
-    rewards_entropy: bool = field(default=False, kw_only=True)
-    is_control: bool = field(default=False, kw_only=True)
+    _: KW_ONLY
+    measures_start: bool = False
+    compares_costs: bool = False
+    rewards_entropy: bool = False
+    is_control: bool = False
 
 
 def _decay(summary: str, decay: Decay) -> TeacherKind:
@@ -118,7 +121,7 @@ def may_measure_start(name: str) -> bool:
 
 
 def is_known_control(name: str) -> bool:
-    """Return whether a curriculum is one of this package's that keep d_t until the deployment phase.
+    """Return whether a curriculum is a control of this package.
 
     Their trials had the event of a hard landing before curricula declared ``is_control``.
     """

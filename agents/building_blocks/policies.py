@@ -38,8 +38,8 @@ class StochasticPolicy(ABC):
         architecture: of the network.
         last_scale: factor on the last layer's initial weights; small means nearly uniform or zero-mean.
         generator: the initialisation's randomness.
-        num_spreads: parameters of the distribution that do not depend on the state, the last ones: m
-            standard deviations, or 0.
+        num_spreads: parameters of the distribution that do not depend on the state, the last ones: m log
+            standard deviations, or none.
 
     Attributes:
         parameters: all of them, in one block.

@@ -176,7 +176,7 @@ class GaussianPolicy(StochasticPolicy):
         return self.outputs(observations)
 
     def probabilities(self, observations: npt.NDArray[np.float32]) -> Floats:
-        """Continuous actions have none.
+        """Raise an error: continuous actions have densities.
 
         Raises:
             ValueError: in any case.

@@ -47,5 +47,5 @@ class FisherMetric:
             stack.pull_back(activations, (weights * distribution.fisher(moved))[None], add=number > 0)
         spreads = map(self._policy.spreads_of, (parameters.gradients, change))
         for gradient, log_std_change in zip(*spreads, strict=True):
-            gradient.copy_(2.0 * log_std_change)  # the Fisher metric of log_std is 2
+            gradient.copy_(2.0 * log_std_change)  # a Gaussian has one, with the metric 2
         return parameters.gradient + self._damping * vector

@@ -43,6 +43,6 @@ def unsuitable(trial: TrialSpec, cmdp: CMDPSpec) -> Iterator[tuple[str, str]]:
     if trial.method.name == "cooling" and not any(trial.deploy_limits):
         yield (
             "methods",
-            f"cooling relaxes a limit in proportion to it, so the deploy_limits of {task}, 0, are never "
+            f"{method} relaxes a limit in proportion to it, so the deploy_limits of {task}, 0, are never "
             "relaxed; use another method, or limits above 0",
         )

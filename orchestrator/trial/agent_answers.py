@@ -31,8 +31,8 @@ def checked_metrics(agent: str, metrics: object, columns: Collection[str]) -> Ma
     checked = _numbers(agent, "update", "metric", metrics)
     if taken := sorted(name for name in checked if name in columns or _RESERVED.fullmatch(name)):
         raise RowError(
-            f"agent {agent}: its metrics must have other names than the columns that "
-            f"every trial has, got {', '.join(taken)}"
+            f"agent {agent}: its metrics must have other names than columns of a trial "
+            f"or of a sweep's tables, got {', '.join(taken)}"
         )
     return checked
 

@@ -228,6 +228,11 @@ class Trial:
         answer = self._teacher.step(self._teacher_state, report)
         self._step, self._teacher_state = self._checked(answer, before=before.limits)
         if self._step.start_limits is not None and self._step.start_limits != before.start_limits:
+            if not self._curriculum.measures_start:
+                raise TypeError(
+                    f"curriculum {self.spec.method.label}: start_limits came after the first step, so its "
+                    "TeacherKind must have measures_start=True"
+                )
             limits = self._step.start_limits.to_json()
             self._event("start limits measured", limits=limits)
             if self.spec.is_no_curriculum(limits):
@@ -271,7 +276,7 @@ class Trial:
         )
 
     def _warn_of_hard_landing(self) -> None:
-        """Record an event if deployment begins with limits far below the last ones, unless it has to."""
+        """Record an event if deployment begins far below the last limits, unless under a control."""
         if self._curriculum.is_control:
             return
         before, after = self._step.limits, self.spec.deploy_limits

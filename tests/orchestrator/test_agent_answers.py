@@ -19,7 +19,18 @@ def test_metrics_may_be_any_numbers() -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["update", "cost_0", "cost_1", "limit_12", "entropy_coefficient", "trial", "task", "method", "seed"],
+    [
+        "update",
+        "cost_0",
+        "cost_1",
+        "limit_12",
+        "entropy_coefficient",
+        "trial",
+        "task",
+        "agent",
+        "method",
+        "seed",
+    ],
 )
 def test_metrics_do_not_take_the_names_of_columns_of_this_or_another_trial(name: str) -> None:
     with pytest.raises(RowError, match=rf"^agent own: its metrics must have other names .* got {name}$"):

@@ -20,7 +20,7 @@ from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.files.trial_warnings import no_curriculum_sentence
+from recrl.orchestrator.files.trial_warnings import HARD_LANDING, landed_hard, no_curriculum_sentence
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.launch_plan import PlannedAction, TrialSelection, make_plan
@@ -525,3 +525,5 @@ def test_a_hard_landing_is_a_warning_unless_the_curriculum_is_a_control(
     flags = curriculum_flags(sweep)
     assert flags["hard_landing"].tolist() == [method == "dynamic" for method in flags["method"]]
     assert not flags["no_curriculum"].any()
+    step = next(it.spec for it in sweep.facts if it.spec.method.name == "step")
+    assert not landed_hard(step, [HARD_LANDING])  # as earlier trials of step have it

@@ -121,11 +121,12 @@ def test_another_seed_gives_other_episodes_and_the_same_seed_the_same(complete: 
     assert not once.equals(other)
 
 
+@pytest.mark.parametrize(("horizon", "most"), [(10, "1,000"), (600, "1,200")])
 def test_an_evaluation_ends_although_only_some_episodes_do(
-    complete: TrialStore, monkeypatch: pytest.MonkeyPatch
+    horizon: int, most: str, complete: TrialStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(evaluation, "MAX_STEPS", 1_000)
-    environments = make_vector("two-state", 2, options={"horizon": 10})
+    environments = make_vector("two-state", 2, options={"horizon": horizon})
     collect = Collector.collect
 
     def without_the_second(self: Collector, *rest: Any) -> Any:
@@ -134,8 +135,8 @@ def test_an_evaluation_ends_although_only_some_episodes_do(
 
     monkeypatch.setattr(Collector, "collect", without_the_second)
     policy, seed = SavedTrial.load(complete).policy, np.random.SeedSequence(0)
-    with pytest.raises(RuntimeError, match="no episode ended in 1,000 steps of an environment"):
-        evaluate(policy, environments, FrozenPolicy.STOCHASTIC, num_episodes=4, seed=seed)
+    with pytest.raises(RuntimeError, match=f"no episode ended in {most} steps of an environment"):
+        evaluate(policy, environments, FrozenPolicy.STOCHASTIC, num_episodes=8, seed=seed)
 
 
 def test_a_stopped_trial_is_looked_at_as_far_as_it_is(tmp_path: Path) -> None:

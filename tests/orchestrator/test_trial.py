@@ -365,6 +365,19 @@ def test_a_curriculum_that_rewards_entropy_declares_it(
     assert run(tmp_path / "declared", spec).updates()["entropy_coefficient"].tolist() == [0, 0, 0.5, 0.5, 0]
 
 
+def test_a_curriculum_that_measures_its_start_declares_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(TEACHERS, "mine", replace(TEACHERS["linear"], measures_start=False))
+    spec = replace(SPEC, method=Choice("mine"))
+    store = SweepStore(tmp_path, "sweep").trial(spec)
+    assert run_recorded(spec, store, should_stop=never) is TrialStatus.FAILED
+    assert store.record().error.startswith(
+        "TypeError: curriculum mine: start_limits came after the first step, so its TeacherKind must have "
+        "measures_start=True"
+    )
+
+
 def test_an_agent_whose_entropy_cannot_be_rewarded_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
