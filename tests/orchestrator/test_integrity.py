@@ -522,8 +522,8 @@ ENTRY = AgentEntry("Fickle.", PPOLagConfig, make)
         ),
         (
             "{**metrics, 'cost_0': 0.0}",
-            "RowError: agent fickle: its metrics must have other names than the columns "
-            "that every trial has, got cost_0 (in update 1; no checkpoint before it)",
+            "RowError: agent fickle: its metrics must have other names than columns "
+            "of a trial or of a sweep's tables, got cost_0 (in update 1; no checkpoint before it)",
         ),
     ],
 )
