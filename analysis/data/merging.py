@@ -15,13 +15,15 @@ import pandas as pd
 
 from recrl.analysis.data.labels import TRIAL, listed
 from recrl.analysis.data.sweep_data import ROWS, Sweep, TrialFacts, assemble
+from recrl.orchestrator.counting import counted
+from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.spec import TrialStatus
 
 OUTCOMES = ("phases", "evaluations")  # data frames that every source has unrounded
 NAMED = 3  # largest number of trials in a note
 
 
-def merge(parts: Sequence[Sweep]) -> Sweep:
+def merge(parts: Sequence[Sweep], *, complete_only: bool = False) -> Sweep:
     """Return all trials of some sweeps, each once, from the part with the most progress.
 
     Damaged trials rank below all others, complete ones above. Then the steps count, then whether the trial
@@ -31,6 +33,10 @@ def merge(parts: Sequence[Sweep]) -> Sweep:
     Args:
         parts: at least one. The first gives the name and the grid file; its trials come first, then the
             trials of other parts.
+        complete_only: leave out trials that no part has completed.
+
+    Raises:
+        RecrlError: only complete trials are wanted, and there are none.
     """
     trials = [{trial.spec.trial_id: trial for trial in part.facts} for part in parts]
     having: dict[str, list[int]] = {}
@@ -41,6 +47,14 @@ def merge(parts: Sequence[Sweep]) -> Sweep:
         trial_id: max(numbers, key=lambda number: _reached(trials[number][trial_id]))
         for trial_id, numbers in having.items()
     }
+    if complete_only:
+        taken = {
+            trial_id: number
+            for trial_id, number in taken.items()
+            if trials[number][trial_id].status is TrialStatus.COMPLETE
+        }
+        if not taken:
+            raise RecrlError(f"no trial is complete, of {counted(len(having), 'trial')}")
     notes = [note for part in parts for note in part.notes]
     if len({part.grid for part in parts if part.grid}) > 1:
         notes.append("the parts have different grid files; the first part's is kept")
@@ -69,8 +83,8 @@ def _taken(parts: Sequence[Sweep], name: str, taken: Mapping[str, int]) -> pd.Da
     for number, part in enumerate(parts):
         rows = part.rows(name)
         ids = np.array([trial.spec.trial_id for trial in part.facts], dtype=object)[rows[TRIAL].to_numpy()]
-        rows = rows.assign(**{TRIAL: [positions[trial_id] for trial_id in ids]})
-        rows = rows[[taken[trial_id] == number for trial_id in ids]]
+        is_taken = np.array([taken.get(trial_id) == number for trial_id in ids], dtype=bool)
+        rows = rows[is_taken].assign(**{TRIAL: [positions[trial_id] for trial_id in ids[is_taken]]})
         if len(rows):  # empty data frames have no column types
             kept.append(rows)
     return pd.concat(kept, ignore_index=True) if kept else pd.DataFrame()

@@ -1,0 +1,150 @@
+"""Draw everything on the page of the Safety Gym table again, from the files in results/safety-gym.
+
+    python -m tests.benchmarks.safety_gym_table
+
+From table.zip come the rows of final policies and of the deployment phase, the differences from ``none``,
+the claims and the figures; from these rows and those of other experiments the power. The page's tables are
+printed.
+"""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from PIL import Image
+
+from recrl.orchestrator.cli.main import main as recrl_sweep
+from tests.benchmarks.differences import paired_differences
+from tests.benchmarks.velocity_table import Cell, number
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "results" / "safety-gym"
+COLOURS = 128  # of a figure in the documentation
+CURRICULA = ("none", "linear", "cosine", "exponential", "dynamic")
+PERIODS = ("phase", "first", "last")
+POLICIES = ("stochastic", "deterministic")
+PILOT = "curricula-today.csv"
+COUNTED = ("agents.csv", PILOT, "margin-control.csv", "table.csv")  # for the spread of ppo-lag
+
+
+def transcript(commands: Sequence[str], folder: Path = RESULTS) -> str:
+    """Run Python scripts, and return what they print, each below its command."""
+    texts = []
+    for command in commands:
+        script = [sys.executable, *shlex.split(command)]
+        answer = subprocess.run(script, cwd=folder, check=True, capture_output=True, text=True)
+        texts.append(f"$ python {command}\n{answer.stdout}")
+    return "\n".join(texts)
+
+
+def write_rows_and_tests() -> None:
+    """Write the rows of the table, and the tests."""
+    scripts = "../../tests/benchmarks"
+    transcript(
+        [
+            f"{scripts}/final_policies.py table.zip --to table.csv",
+            f"{scripts}/deployment_phase.py table.zip --to table-deployment-phase.csv",
+        ]
+    )
+    tests = [
+        f"{scripts}/differences.py {tables} --against none --policy {policy}"
+        for tables in ("table.csv", f"{PILOT} table.csv")
+        for policy in POLICIES
+    ]
+    (RESULTS / "table-differences.txt").write_text(transcript(tests))
+    tables = " ".join(f"results/safety-gym/{name}" for name in COUNTED)
+    powers = [
+        f"tests/benchmarks/power.py {tables}{tests}"
+        for tables in (tables, "results/safety-gym/cpo-curricula.csv")
+        for tests in ("", " --tests 24")
+    ]
+    (RESULTS / "power.txt").write_text(transcript(powers, ROOT))
+
+
+def draw() -> None:
+    """Draw the report; keep its claims, and its figures with fewer colours."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        if code := recrl_sweep(["figures", str(RESULTS / "table.zip"), "--to", name]):
+            raise SystemExit(code)
+        (RESULTS / "table-claims.csv").write_bytes((folder / "claims.csv").read_bytes())
+        for figure in [folder / "return-against-cost.png", *folder.glob("learning-curves_*.png")]:
+            image = Image.open(figure).convert("RGB").quantize(COLOURS)
+            image.save(ROOT / "docs/_static" / f"safety-gym-table-{figure.name}", optimize=True)
+
+
+def policy_table(rows: pd.DataFrame) -> Iterator[str]:
+    """Yield the lines of the table of final policies, a column a seed."""
+    seeds = sorted(rows["seed"].unique())
+    yield "| task | agent | policy | curriculum | " + " | ".join(f"seed {it}" for it in seeds) + " | mean |"
+    yield "|---" * (5 + len(seeds)) + "|"
+    for (task, agent), of_agent in rows.groupby(["task", "agent"], sort=False):
+        for policy in POLICIES:
+            for method in CURRICULA:
+                group = of_agent[(of_agent["policy"] == policy) & (of_agent["method"] == method)]
+                if len(group):
+                    cell = Cell.of(str(task), str(agent), group)
+                    of_seed = group.set_index("seed")[["return", "cost"]]
+                    each = [
+                        f"{of_seed.loc[it, 'return']:.1f} / {of_seed.loc[it, 'cost']:.1f}"
+                        if it in of_seed.index
+                        else ""
+                        for it in seeds
+                    ]
+                    mean = f"{cell.interval} / {cell.costs.replace('+-', '±')}"
+                    yield f"| {task} | `{agent}` | {policy} | `{method}` | {' | '.join(each)} | {mean} |"
+
+
+def shown(row: pd.Series[Any]) -> str:
+    """Return a difference with its interval and its corrected p value."""
+    mean, low, high = (number(row[name]) for name in ("return", "low", "high"))
+    return f"{mean} ({low} to {high}), p = {row['p_holm']:.3f}"
+
+
+def difference_table(fresh: pd.DataFrame, seen: pd.DataFrame) -> Iterator[str]:
+    """Yield the lines of the table of differences in return from ``none``, without and with the pilot."""
+    yield "| task | agent | policy | curriculum | three fresh seeds | with the pilot |"
+    yield "|---" * 6 + "|"
+    keys = ["task", "agent", "method"]
+    for policy in POLICIES:
+        tables = [
+            paired_differences(rows[rows["policy"] == policy], "none", "return").set_index(keys)
+            for rows in (fresh, pd.concat([seen, fresh]))
+        ]
+        for key in tables[0].index:
+            texts = [shown(table.loc[key]) for table in tables]
+            yield f"| {key[0]} | `{key[1]}` | {policy} | `{key[2]}` | {' | '.join(texts)} |"
+
+
+def phase_table(rows: pd.DataFrame) -> Iterator[str]:
+    """Yield the lines of the table of the deployment phase, means over the seeds."""
+    yield "| task | agent | curriculum | whole phase | first 100,000 steps | last 100,000 steps |"
+    yield "|---" * 6 + "|"
+    for (task, agent), of_agent in rows.groupby(["task", "agent"]):
+        means = of_agent.groupby(["method", "policy"])[["return", "cost"]].mean()
+        cells = means.apply(lambda it: f"{it['return']:.1f} / {it['cost']:.1f}", axis=1).unstack()
+        for method in CURRICULA:
+            if method in cells.index:
+                texts = " | ".join(str(cells.loc[method, period]) for period in PERIODS)
+                yield f"| {task} | `{agent}` | `{method}` | {texts} |"
+
+
+def main() -> None:
+    """Write the files, and print the page's tables."""
+    write_rows_and_tests()
+    draw()
+    fresh, seen = (pd.read_csv(RESULTS / name) for name in ("table.csv", PILOT))
+    phase = pd.read_csv(RESULTS / "table-deployment-phase.csv")
+    for table in (policy_table(fresh), difference_table(fresh, seen), phase_table(phase)):
+        print("\n" + "\n".join(table))
+
+
+if __name__ == "__main__":
+    main()
