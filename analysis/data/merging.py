@@ -15,7 +15,6 @@ import pandas as pd
 
 from recrl.analysis.data.labels import TRIAL, listed
 from recrl.analysis.data.sweep_data import ROWS, Sweep, TrialFacts, assemble
-from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.spec import TrialStatus
 
@@ -54,7 +53,7 @@ def merge(parts: Sequence[Sweep], *, complete_only: bool = False) -> Sweep:
             if trials[number][trial_id].status is TrialStatus.COMPLETE
         }
         if not taken:
-            raise RecrlError(f"no trial is complete, of {counted(len(having), 'trial')}")
+            raise RecrlError(f"none of the {len(having)} trials is complete")
     notes = [note for part in parts for note in part.notes]
     if len({part.grid for part in parts if part.grid}) > 1:
         notes.append("the parts have different grid files; the first part's is kept")

@@ -288,7 +288,7 @@ def test_without_a_complete_trial_there_is_nothing_to_keep(
     export.save(part(unfinished=TITLES), tmp_path / "one.zip")
     command = ["merge", str(tmp_path / "one.zip"), "--to", str(tmp_path / "all.zip"), "--complete"]
     assert main(command) == ExitCode.WRONG_INPUT
-    assert capsys.readouterr().err == "recrl-sweep: no trial is complete, of 8 trials\n"
+    assert capsys.readouterr().err == "recrl-sweep: none of the 8 trials is complete\n"
     assert not (tmp_path / "all.zip").exists()
 
 
