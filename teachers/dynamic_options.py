@@ -94,7 +94,7 @@ class DynamicConfig(Options):
     remaining: Literal["windows", "episodes"] = Field(
         default="windows",
         description="Divisor of the step of line 7. windows: remaining windows but two, which "
-        "reaches deploy_limits before B. episodes: remaining episodes after the next "
+        "can reach deploy_limits before B. episodes: remaining episodes after the next "
         "one, B - b (literal), which does not.",
     )
     clock_reset: Literal["change", "convergence"] = Field(

@@ -5,8 +5,8 @@ reward's surrogate. Otherwise the step decreases the surrogate of a violated cos
 the most violated cost in standard deviations of its advantages, so the costs' units do not matter. Nothing is
 carried over to the next update, so a changed limit takes effect immediately.
 
-Steps of constant length oscillate about the optimum; the source's proof is for steps that shrink during
-learning. So, ours, their length depends on the remaining gain. Symbols are as in
+Steps of constant length oscillate about the optimum; in the source's proof they are smaller the longer the
+run. Here, instead, their length depends on the remaining gain. Symbols are as in
 ``recrl.agents.trust_region.cpo_dual``, but g is the gradient of the reward, v = H^-1 g, q = g.v, r_i = b_i.v.
 With
 
