@@ -11,9 +11,10 @@ Requirements for a scalar environment:
 - It is a function of its seed and its actions: ``reset(seed=...)`` determines an episode.
 
 An environment may name its costs in an attribute ``cost_names``. Its horizon, for the agents' defaults, is
-the smallest of ``spec.max_episode_steps``, a number in an attribute ``horizon``, and the steps of Gymnasium's
-``TimeLimit``. It may describe the slices of its flattened observation in ``observation_components``, a
-sequence of ``recrl.environments.cmdp.ObservationComponent``; from it agents learn which of them are lidars.
+the smallest of ``spec.max_episode_steps``, a number in an attribute ``horizon`` or ``max_episode_steps``, and
+the steps of Gymnasium's ``TimeLimit``. It may describe the slices of its flattened observation in
+``observation_components``, a sequence of ``recrl.environments.cmdp.ObservationComponent``; from it agents
+learn which of them are lidars.
 Observations of any kind are flattened to float32 vectors (``gymnasium.spaces.flatten``), actions clipped to
 their bounds.
 
@@ -310,7 +311,8 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
                 f"'cost'{others} (for zero costs: the task gymnasium with costless: true)"
             )
         try:
-            costs = np.asarray(info["cost"], np.float64).reshape(-1)
+            reported = np.asarray(info["cost"])
+            costs = reported.astype(np.float64, casting="same_kind").reshape(-1)  # refuses text
         except (TypeError, ValueError):
             costs = np.empty(0)
         if costs.shape != (self.cmdp.num_costs,) or not np.isfinite(costs).all():
@@ -370,14 +372,15 @@ def _are_names(value: object) -> bool:
 
 def _declared_horizon(environment: Environment) -> int | None:
     """Return the steps after which an environment truncates an episode, or None if it does not say."""
-    declared = environment.get_wrapper_attr("horizon") if environment.has_wrapper_attr("horizon") else None
-    if isinstance(declared, float) and declared.is_integer():
-        declared = int(declared)
     horizons = list(_time_limits(environment))
     if environment.spec is not None and environment.spec.max_episode_steps is not None:
         horizons.append(environment.spec.max_episode_steps)
-    if isinstance(declared, int | np.integer) and not isinstance(declared, bool) and declared >= 1:
-        horizons.append(int(declared))
+    for name in ("horizon", "max_episode_steps"):
+        declared = environment.get_wrapper_attr(name) if environment.has_wrapper_attr(name) else None
+        if isinstance(declared, float) and declared.is_integer():
+            declared = int(declared)
+        if isinstance(declared, int | np.integer) and not isinstance(declared, bool) and declared >= 1:
+            horizons.append(int(declared))
     return min(horizons, default=None)
 
 

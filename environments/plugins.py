@@ -277,8 +277,9 @@ def nearest(name: str, known: Sequence[str]) -> str:
 
 def nearest_name(name: str, known: Sequence[str]) -> str | None:
     """Return the known name that is nearest; None if no name is near."""
-    near = difflib.get_close_matches(name, known, n=1)
-    return near[0] if near else None
+    spelt = {each.lower(): each for each in known}
+    near = difflib.get_close_matches(name.lower(), spelt, n=1)
+    return spelt[near[0]] if near else None
 
 
 def check_keywords(function: Callable[..., Any], name: str, keywords: Mapping[str, Any]) -> None:

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import difflib
 import errno
+import sysconfig
+import traceback
 from pathlib import Path
+from types import FrameType
+
+INSTALLED = ("stdlib", "platstdlib", "purelib", "platlib")  # kinds of folders, as sysconfig calls them
 
 
 class RecrlError(Exception):
@@ -112,6 +117,27 @@ def described(error: BaseException) -> str:
     except Exception:  # a user's own class may fail here
         text = "its text cannot be read"
     return " ".join(f"{type(error).__name__}: {text}".split()).removesuffix(":")
+
+
+def described_with_place(error: BaseException) -> str:
+    """Return an error as one line, with the last place in the user's own code, if there is one.
+
+    Own code is neither recrl's nor installed: ``KeyError: 'x' (task.py, line 90, in step)``.
+    """
+    places = [
+        f"{Path(frame.f_code.co_filename).name}, line {line}, in {frame.f_code.co_name}"
+        for frame, line in traceback.walk_tb(error.__traceback__)
+        if _is_own_code(frame)
+    ]
+    return f"{described(error)} ({places[-1]})" if places else described(error)
+
+
+def _is_own_code(frame: FrameType) -> bool:
+    """Whether a frame runs a file that is neither recrl's nor installed."""
+    file = frame.f_code.co_filename
+    if file.startswith("<") or str(frame.f_globals.get("__name__")).partition(".")[0] == "recrl":
+        return False
+    return not any(Path(file).is_relative_to(sysconfig.get_path(kind)) for kind in INSTALLED)
 
 
 def first_line(error: BaseException) -> str:

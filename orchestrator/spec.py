@@ -135,7 +135,7 @@ class TrialSpec:
         )
 
     def is_no_curriculum(self, start_limits: Sequence[float | str] | None) -> bool:
-        """Whether the measured d_t is not above d_d anywhere: then the limits are d_d from the start.
+        """Whether the measured d_t is not above d_d anywhere: then the limits are d_d once it is measured.
 
         Args:
             start_limits: the measured d_t, [k]; None if it was not measured.

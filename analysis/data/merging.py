@@ -22,7 +22,7 @@ OUTCOMES = ("phases", "evaluations")  # data frames that every source has unroun
 NAMED = 3  # largest number of trials in a note
 
 
-def merge(parts: Sequence[Sweep], *, complete_only: bool = False) -> Sweep:
+def merge(parts: Sequence[Sweep], *, finished_only: bool = False) -> Sweep:
     """Return all trials of some sweeps, each once, from the part with the most progress.
 
     Damaged trials rank below all others, complete ones above. Then the steps count, then whether the trial
@@ -32,10 +32,10 @@ def merge(parts: Sequence[Sweep], *, complete_only: bool = False) -> Sweep:
     Args:
         parts: at least one. The first gives the name and the grid file; its trials come first, then the
             trials of other parts.
-        complete_only: leave out trials that no part has completed.
+        finished_only: leave out trials that are waiting or running. Failed ones stay: they count in verdicts.
 
     Raises:
-        RecrlError: only complete trials are wanted, and there are none.
+        RecrlError: only finished trials are wanted, and there are none.
     """
     trials = [{trial.spec.trial_id: trial for trial in part.facts} for part in parts]
     having: dict[str, list[int]] = {}
@@ -46,14 +46,14 @@ def merge(parts: Sequence[Sweep], *, complete_only: bool = False) -> Sweep:
         trial_id: max(numbers, key=lambda number: _reached(trials[number][trial_id]))
         for trial_id, numbers in having.items()
     }
-    if complete_only:
+    if finished_only:
         taken = {
             trial_id: number
             for trial_id, number in taken.items()
-            if trials[number][trial_id].status is TrialStatus.COMPLETE
+            if trials[number][trial_id].status not in (TrialStatus.WAITING, TrialStatus.RUNNING)
         }
         if not taken:
-            raise RecrlError(f"none of the {len(having)} trials is complete")
+            raise RecrlError(f"none of the {len(having)} trials is finished")
     notes = [note for part in parts for note in part.notes]
     if len({part.grid for part in parts if part.grid}) > 1:
         notes.append("the parts have different grid files; the first part's is kept")

@@ -138,7 +138,7 @@ def _markdown(sweep: Sweep, drawn: list[Path], figures: Mapping[str, Drawing], t
         caption = table_formats.markdown_text(figures[path.stem].caption)
         lines += [f"![{path.stem}]({path.name})", "", f"{caption}.", ""]
     for it in tables.shown:
-        lines += [f"## {it.heading}", "", table_formats.markdown(it.table), ""]
+        lines += [f"## {table_formats.markdown_text(it.heading)}", "", table_formats.markdown(it.table), ""]
         lines += [it.note, ""] if it.note else []
     provenance = "\n".join(_provenance(sweep)).splitlines()
     return "\n".join([*lines, "## Provenance", "", *(f"    {line}" for line in provenance)])

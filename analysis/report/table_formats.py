@@ -33,6 +33,9 @@ LATEX = {
     "%": r"\%",
     "_": r"\_",
     "#": r"\#",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
     "±": r"$\pm$",
     "≤": r"$\leq$",
     TOO_FEW: r"$\dagger$",
@@ -206,4 +209,6 @@ def _written(data: bytes, path: Path) -> Path:
 
 def _latex_line(cells: Sequence[str]) -> str:
     escaped = ["".join(LATEX.get(letter, letter) for letter in cell.replace("–", "--")) for cell in cells]
+    if escaped[0].startswith(("[", "*")):  # after \\ they would be its arguments
+        escaped[0] = "{}" + escaped[0]
     return " & ".join(escaped) + r" \\"

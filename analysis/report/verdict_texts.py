@@ -25,7 +25,7 @@ UNEVALUATED = "not evaluated"
 WARNINGS = {
     "no_curriculum": (
         "curriculum without effect",
-        "Curriculum without effect: the measured d_t is not above d_d, so the limit was d_d from the start.",
+        "Curriculum without effect: the measured d_t is not above d_d, so the limit was d_d after that.",
     ),
     "hard_landing": (
         "hard landing",

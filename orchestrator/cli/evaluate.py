@@ -127,6 +127,10 @@ def _chosen(store: SweepStore, request: EvaluateRequest) -> tuple[list[TrialStor
     """
     text = " ".join(request.trial)
     found = store.find(text)
+    if text and not found:
+        raise RecrlError(
+            f"{store.name}: no trials on disk begin with {text!r}; see {command_line('status', store)}"
+        )
     only = parse_only(request.only)
     specs, damaged = [], set()
     for trial in found:
@@ -142,8 +146,7 @@ def _chosen(store: SweepStore, request: EvaluateRequest) -> tuple[list[TrialStor
     if not in_grid and orphans:
         raise RecrlError(f"{store.name}: {_no_longer(orphans)}")
     if not in_grid:
-        begin = f" begin with {text!r}" if text else ""
-        raise RecrlError(f"{store.name}: no trials on disk{begin}; see {command_line('status', store)}")
+        raise RecrlError(f"{store.name}: no trials on disk; see {command_line('status', store)}")
     return in_grid, orphans
 
 

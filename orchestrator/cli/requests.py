@@ -294,8 +294,8 @@ class MergeRequest(Request):
         help="the first gives the name; if several have a trial, the furthest is used",
     )
     to: Path = by_flag(type=types.zip_file, metavar="FILE.zip", required=True, help="the output file")
-    complete: bool = by_flag(
-        action="store_true", help="leave out trials that no part has completed, instead of listing them"
+    finished: bool = by_flag(
+        action="store_true", help="leave out trials that are waiting or running; failed ones stay"
     )
 
 

@@ -57,7 +57,7 @@ def run_merge(request: MergeRequest, console: Console) -> ExitCode:
     for path in request.parts:
         if path.suffix != export.SUFFIX:
             raise RecrlError(f"{path}: merge joins files that export wrote (.zip): recrl-sweep export SWEEP")
-    sweep = merging.merge([export.load(path) for path in request.parts], complete_only=request.complete)
+    sweep = merging.merge([export.load(path) for path in request.parts], finished_only=request.finished)
     _say_file(export.save(sweep, request.to), sweep, console)
     for note in sweep.notes:
         say(console, note)

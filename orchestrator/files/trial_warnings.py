@@ -24,14 +24,16 @@ def landed_hard(spec: TrialSpec, events: Iterable[str]) -> bool:
 
 def no_curriculum_sentence(titles: Sequence[str]) -> str:
     """Return the warning about trials whose measured d_t is not above d_d; empty for none."""
-    what = "the measured d_t is not above d_d, so the curriculum has no effect"
+    what = "the measured d_t is not above d_d, so the limit is d_d after the measurement"
     return _warning(what, titles, "give a finite train_limits above d_d")
 
 
 def hard_landing_sentence(titles: Sequence[str]) -> str:
     """Return the warning about trials that ``landed_hard``; empty for none."""
     what = "hard landing, the limit was still far above d_d when deployment began"
-    return _warning(what, titles, "give the curriculum more steps, a smaller window or a smaller d_t")
+    return _warning(
+        what, titles, "give the curriculum more steps or a smaller d_t, or dynamic a smaller window"
+    )
 
 
 def no_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
@@ -49,7 +51,11 @@ def no_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
 def unknown_horizon_sentence(tasks: Sequence[str]) -> str:
     """Return the warning about tasks that do not say how long an episode may be; empty for none."""
     what = "unknown horizon, and an episode that never ends gives no result"
-    return _warning(what, tasks, "let step return truncated=True, and give max_episode_steps or TimeLimit")
+    return _warning(
+        what,
+        tasks,
+        "let step return truncated=True, and give the environment an attribute horizon, or TimeLimit",
+    )
 
 
 def _warning(what: str, titles: Sequence[str], remedy: str) -> str:

@@ -12,7 +12,7 @@ from recrl.agents.registry import AGENTS, make_agent
 from recrl.environments.cmdp import CMDPSpec
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
 from recrl.environments.registry import TASKS, make_vector
-from recrl.orchestrator.errors import USERS_ERRORS, described
+from recrl.orchestrator.errors import USERS_ERRORS, described, described_with_place
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.problem_list import TASK_MARK
 from recrl.orchestrator.located_yaml import Place
@@ -39,14 +39,14 @@ def cmdp_of(task: Choice) -> CMDPSpec:
     try:
         envs = make_vector(task.name, 1, options=task.options)
     except USERS_ERRORS as error:
-        raise BuildError(f"{task.name} cannot be built: {described(error)}") from error
+        raise BuildError(f"{task.name} cannot be built: {described_with_place(error)}") from error
     try:
         if isinstance(envs, SyncCMDPVectorEnv):  # a user's environment: does a step report its cost?
             envs.reset(seed=0)
             envs.action_space.seed(0)
             envs.step(envs.action_space.sample())
     except USERS_ERRORS as error:
-        raise BuildError(f"{task.name} fails in its first step: {described(error)}") from error
+        raise BuildError(f"{task.name} fails in its first step: {described_with_place(error)}") from error
     finally:
         try:
             envs.close()
@@ -93,7 +93,7 @@ def _agents_mistake(spec: TrialSpec, cmdp: CMDPSpec, *, is_rehearsed: bool) -> s
     try:
         make_agent(spec.agent.name, cmdp, spec.agent.options, np.random.SeedSequence(0))
     except USERS_ERRORS as error:
-        return f"cannot be built on {TASK_MARK}: {described(error)}"
+        return f"cannot be built on {TASK_MARK}: {described_with_place(error)}"
     if not is_rehearsed:
         return ""
     if mistake := _mistake(replace(spec, method=NO_CURRICULUM)):
@@ -108,7 +108,7 @@ def _curriculums_mistake(spec: TrialSpec, cmdp: CMDPSpec, *, is_rehearsed: bool)
     try:
         _check_start(spec, cmdp)
     except USERS_ERRORS as error:
-        return f"cannot be started on {TASK_MARK}: {described(error)}"
+        return f"cannot be started on {TASK_MARK}: {described_with_place(error)}"
     mistake = _mistake(replace(spec, agent=PLAIN_AGENT)) if is_rehearsed else ""
     return f"on {TASK_MARK} {mistake}" if mistake else ""
 
@@ -128,7 +128,7 @@ def _mistake(spec: TrialSpec) -> str:
     except FinalPolicyError as error:
         return f"can learn, but its final policy fails: {error}"
     except USERS_ERRORS as error:
-        return f"fails in its first updates: {described(error)}"
+        return f"fails in its first updates: {described_with_place(error)}"
     return ""
 
 

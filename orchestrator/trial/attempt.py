@@ -196,7 +196,7 @@ def run_recorded(
         except USERS_ERRORS as error:
             if isinstance(error, SystemExit) and should_stop():  # a second signal to a stopping worker
                 return _close(writer, TrialStatus.WAITING)
-            logger.exception("failed; its files end at update %d", writer.record.update)
+            logger.exception("failed; rows and checkpoint end at the last commit")
             notes = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
             text = shown(f"{described(error)}{notes}")
             return _close(writer, TrialStatus.FAILED, error=text, traceback=shown(traceback.format_exc()))

@@ -260,20 +260,19 @@ def test_the_command_writes_one_file(part: Part, tmp_path: Path, capsys: pytest.
     assert main(["figures", str(to), "--sketch", "--to", str(tmp_path / "figures")]) == ExitCode.OK
 
 
-def test_only_complete_trials_are_kept_if_that_is_wanted(
+def test_only_finished_trials_are_kept_if_that_is_wanted(
     part: Part, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The rows of the others are left out, too, and those of the kept trials still belong to them."""
+    """The rows of the others are left out, too. Failed trials stay: verdicts count them."""
     paths = [tmp_path / "one.zip", tmp_path / "two.zip"]
     export.save(part("one", missing=TITLES[4:], unfinished=TITLES[:1]), paths[0])
     export.save(part("two", missing=TITLES[1:4], unfinished=TITLES[:1], failed=TITLES[5:6]), paths[1])
     to = tmp_path / "all.zip"
-    assert main(["merge", *map(str, paths), "--to", str(to), "--complete"]) == ExitCode.OK
-    assert "all.zip: 6 trials, 6 of them complete, " in capsys.readouterr().out
-    left_out = [TITLES[0], TITLES[5]]
-    expected = merge([part("whole", missing=left_out)])
+    assert main(["merge", *map(str, paths), "--to", str(to), "--finished"]) == ExitCode.OK
+    assert "all.zip: 7 trials, 6 of them complete, " in capsys.readouterr().out
+    expected = merge([part("whole", missing=TITLES[:1], failed=TITLES[5:6])])
     kept = export.load(to)
-    assert {trial.spec.title for trial in kept.facts} == set(TITLES) - set(left_out)
+    assert {trial.spec.title for trial in kept.facts} == set(TITLES[1:])
     for name in ("phases", "evaluations"):
         keys = ["task", "agent", "method", "seed"]
         found, wanted = (getattr(it, name).sort_values(keys, kind="stable") for it in (kept, expected))
@@ -282,13 +281,13 @@ def test_only_complete_trials_are_kept_if_that_is_wanted(
         )
 
 
-def test_without_a_complete_trial_there_is_nothing_to_keep(
+def test_without_a_finished_trial_there_is_nothing_to_keep(
     part: Part, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     export.save(part(unfinished=TITLES), tmp_path / "one.zip")
-    command = ["merge", str(tmp_path / "one.zip"), "--to", str(tmp_path / "all.zip"), "--complete"]
+    command = ["merge", str(tmp_path / "one.zip"), "--to", str(tmp_path / "all.zip"), "--finished"]
     assert main(command) == ExitCode.WRONG_INPUT
-    assert capsys.readouterr().err == "recrl-sweep: none of the 8 trials is complete\n"
+    assert capsys.readouterr().err == "recrl-sweep: none of the 8 trials is finished\n"
     assert not (tmp_path / "all.zip").exists()
 
 

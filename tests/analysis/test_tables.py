@@ -152,6 +152,14 @@ def test_markdown_and_latex_by_hand() -> None:
     ]
 
 
+def test_labels_that_mean_something_in_latex() -> None:
+    r"""After \\ a bracket would be its length, and an asterisk its variant."""
+    table = pd.DataFrame({"task": ["[b] x", "*a"], "method": ["a|b <c>", "[d]"]})
+    lines = table_formats.latex(table).splitlines()
+    assert r"{}[b] x & a\textbar{}b \textless{}c\textgreater{} \\" in lines
+    assert r"{}*a & [d] \\" in lines
+
+
 def test_csv_keeps_every_digit(tmp_path: Path) -> None:
     frame = pd.DataFrame({"value": [0.1 + 0.2, 1e-17, 9.5]})
     path = table_formats.write_csv(frame, tmp_path / "deep" / "frame.csv")

@@ -31,6 +31,8 @@ CONFIDENCE = 0.95
 def read(paths: Sequence[Path], policy: str, limit: float) -> pd.DataFrame:
     """The rows of one kind of policy that keep a limit."""
     rows = pd.concat([pd.read_csv(path, comment="#") for path in paths], ignore_index=True)
+    if rows.duplicated(["task", "agent", "method", "seed", "policy"]).any():
+        raise SystemExit("a trial is in the tables twice")
     kept = rows["cost"] <= limit + rows["cost_se"] if math.isfinite(limit) else True
     return rows[(rows["policy"] == policy) & kept]
 
@@ -123,6 +125,9 @@ def main() -> None:
         return
     control = read(arguments.control, arguments.policy, arguments.limit)
     rows = rows[rows["task"].isin(control["task"])]
+    for table in (rows, control):
+        if (table.groupby(["task", "agent"])["method"].nunique() > 1).any():
+            raise SystemExit("--control: a table has several curricula of one agent; use --against")
     one_agent = bool((rows.groupby("task")["agent"].nunique() == 1).all())
     for column in ("return", "cost"):
         print(f"{column}: difference, 95% interval, p, p corrected for all rows")

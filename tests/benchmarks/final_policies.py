@@ -19,7 +19,11 @@ KEYS = ["task", "agent", "method", "seed", "policy"]
 
 def final_policies(sweep: Path) -> pd.DataFrame:
     """Means over the episodes of each evaluation, with standard errors; complete trials only."""
-    evaluations = recrl.load_sweep(sweep).evaluations
+    loaded = recrl.load_sweep(sweep)
+    if loaded.num_costs > 1:
+        raise SystemExit(f"{sweep}: has {loaded.num_costs} costs; the table has one")
+    complete = loaded.trials.loc[loaded.trials["status"] == "complete", KEYS[:-1]]
+    evaluations = loaded.evaluations.merge(complete, on=KEYS[:-1])
     grouped = evaluations.groupby(KEYS, observed=True)
     columns = {"return": "episode_return", "cost": "cost_0"}
     table: dict[str, pd.Series[Any]] = {"episodes": grouped.size()}

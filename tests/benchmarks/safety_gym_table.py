@@ -1,10 +1,10 @@
-"""Draw everything on the page of the Safety Gym table again, from the files in results/safety-gym.
+"""Draw what is on the page of the Safety Gym table again, from the files in results/safety-gym.
 
     python -m tests.benchmarks.safety_gym_table
 
 From table.zip come the rows of final policies and of the deployment phase, the differences from ``none``,
-the claims and the figures; from these rows and those of other experiments the power. The page's tables are
-printed.
+the claims and the figures; from these rows and those of other experiments the power. Printed are the rows of
+which the page's tables are made.
 """
 
 from __future__ import annotations
@@ -31,7 +31,13 @@ CURRICULA = ("none", "linear", "cosine", "exponential", "dynamic")
 PERIODS = ("phase", "first", "last")
 POLICIES = ("stochastic", "deterministic")
 PILOT = "curricula-today.csv"
-COUNTED = ("agents.csv", PILOT, "margin-control.csv", "table.csv")  # for the spread of ppo-lag
+COUNTED = (
+    "agents.csv",
+    PILOT,
+    "margin-control.csv",
+    "table.csv",
+    "button-confirm.csv",
+)  # for the spread of ppo-lag
 
 
 def transcript(commands: Sequence[str], folder: Path = RESULTS) -> str:

@@ -206,14 +206,15 @@ def test_a_wrapper_that_changes_observations_must_say_what_they_consist_of() -> 
         (0, None, None),
     ],
 )
+@pytest.mark.parametrize("name", ["horizon", "max_episode_steps"])
 def test_the_horizon_is_the_specs_or_else_the_environments(
-    attribute: Any, spec_horizon: int | None, horizon: int | None
+    name: str, attribute: Any, spec_horizon: int | None, horizon: int | None
 ) -> None:
     def build() -> Countdown:
         environment = Countdown()
         environment.spec = gymnasium.envs.registration.EnvSpec("C-v0", max_episode_steps=spec_horizon)
         if attribute is not None:
-            environment.horizon = attribute  # type: ignore[attr-defined]
+            setattr(environment, name, attribute)
         return environment
 
     assert SyncCMDPVectorEnv("countdown", [build]).cmdp.horizon == horizon
@@ -389,6 +390,11 @@ def test_an_id_with_a_module_in_front_imports_it_first(identifier: str) -> None:
         (
             "cost",
             "x",
+            "wrong: info['cost'] must be a finite number for each of cost (the environment's cost_names), ",
+        ),
+        (
+            "cost",
+            "1",
             "wrong: info['cost'] must be a finite number for each of cost (the environment's cost_names), ",
         ),
         ("terminated", "no", "wrong: terminated must be True or False, got str 'no'"),

@@ -869,7 +869,7 @@ def test_a_task_that_does_not_say_how_long_an_episode_may_be_is_a_warning(
         assert main([command, "grid.yaml", "--trust"]) == ExitCode.OK
         assert (
             "warning: unknown horizon, and an episode that never ends gives no result: room; let step return "
-            "truncated=True, and give max_episode_steps or TimeLimit"
+            "truncated=True, and give the environment an attribute horizon, or TimeLimit"
         ) in capsys.readouterr().out.splitlines()
 
 

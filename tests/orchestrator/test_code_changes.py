@@ -469,8 +469,8 @@ def test_the_sentences_count() -> None:
     )
     assert no_curriculum_sentence([]) == ""
     assert no_curriculum_sentence([f"t{i}" for i in range(7)]) == (
-        "the measured d_t is not above d_d, so the curriculum has no effect: t0, t1, t2, t3, t4 and 2 more; "
-        "give a finite train_limits above d_d"
+        "the measured d_t is not above d_d, so the limit is d_d after the measurement: t0, t1, t2, t3, t4 "
+        "and 2 more; give a finite train_limits above d_d"
     )
 
 
@@ -494,8 +494,8 @@ def test_a_curriculum_that_is_none_is_an_event_and_a_warning(
     capsys.readouterr()
     assert main(["status", "--brief"]) == ExitCode.OK
     sentence = (
-        "the measured d_t is not above d_d, so the curriculum has no effect: two-state ppo-lag linear "
-        "seed 0, two-state ppo-lag dynamic seed 0; give a finite train_limits above d_d"
+        "the measured d_t is not above d_d, so the limit is d_d after the measurement: two-state ppo-lag "
+        "linear seed 0, two-state ppo-lag dynamic seed 0; give a finite train_limits above d_d"
     )
     assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"
     assert sentence in pages.missing(sweep_data.load(store))
@@ -516,7 +516,7 @@ def test_a_hard_landing_is_a_warning_unless_the_curriculum_is_a_control(
     assert main(["status", "--brief"]) == ExitCode.OK
     sentence = (
         "hard landing, the limit was still far above d_d when deployment began: two-state ppo-lag dynamic "
-        "seed 0; give the curriculum more steps, a smaller window or a smaller d_t"
+        "seed 0; give the curriculum more steps or a smaller d_t, or dynamic a smaller window"
     )
     assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"
     assert f"warning: {sentence}" in launched

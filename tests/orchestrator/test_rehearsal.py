@@ -87,6 +87,11 @@ class Limited(Wrapped):
         return {**self.agent.update(rollout, costs, step), "whole": int(step.limits.values[0])}
 
 
+class Falling(Wrapped):
+    def update(self, rollout, costs, step):
+        np.reshape(rollout.rewards, (0, 7))
+
+
 class NoMode(Wrapped):
     def update(self, rollout, costs, step):
         return self.agent.update(rollout, costs, step)
@@ -142,6 +147,7 @@ def entry(kind):
 COUNTER, INFINITE, ODD_NAME, NO_RESTORE = map(entry, (Wrapped, Infinite, OddName, NoRestore))
 SILENT, LIMITED, NO_MODE = map(entry, (Silent, Limited, NoMode))
 NO_NOISE, LISTED, REORDERED, ODD_NOISE = map(entry, (NoNoise, Listed, Reordered, OddNoise))
+FALLING = entry(Falling)
 
 
 class Staircase:
@@ -226,6 +232,13 @@ def test_a_task_that_fails_after_its_first_step() -> None:
     (problem,) = problems(task="own_rehearsed:Broken")
     assert problem.startswith("grid.yaml:2: tasks.0: own_rehearsed:Broken fails in its first updates: ")
     assert "cost" in problem
+
+
+def test_an_error_in_own_code_says_where_it_was_raised() -> None:
+    """The place is the last one that is neither in recrl nor installed: not NumPy's below it."""
+    (problem,) = problems(agents=["own_rehearsed:FALLING"])
+    assert "(own_rehearsed.py, line " in problem
+    assert problem.endswith(", in update)")
 
 
 @pytest.mark.parametrize(

@@ -491,7 +491,7 @@ def test_a_trial_that_raises_is_failed_with_its_traceback(tmp_path: Path) -> Non
     assert run_recorded(spec, store, should_stop=never) is TrialStatus.FAILED
     assert "not a number" in store.record().error
     assert "Traceback" in store.error_path.read_text()
-    assert "failed; its files end at update 0" in store.log_path.read_text()
+    assert "failed; rows and checkpoint end at the last commit" in store.log_path.read_text()
 
 
 def test_the_run_says_what_it_was_made_of(undisturbed: TrialStore) -> None:
