@@ -7,9 +7,9 @@
 Tables are those of ``final_policies.py``. With ``--control`` each group is the seeds of one agent on one
 task, and the groups are independent; a task without a control is left out. With one agent a task the last
 line averages the tasks' differences, with the variance within groups pooled. With ``--against`` the control
-is that curriculum in the same tables, and trials are paired by seed. With ``--limit`` only policies count
-whose mean cost is at most one standard error, over episodes, above it. The p values are corrected for all
-rows that are printed, by Holm's method.
+is that curriculum in the same tables, and trials are paired by seed, or with ``--groups`` independent. With
+``--limit`` only policies count whose mean cost is at most one standard error, over episodes, above it. The p
+values are corrected for all rows that are printed, by Holm's method.
 """
 
 from __future__ import annotations
@@ -76,16 +76,26 @@ def paired(differences: Floats) -> tuple[float, float, float, float]:
     return float(differences.mean()), float(low), float(high), float(test.pvalue)
 
 
-def paired_differences(rows: pd.DataFrame, baseline: str, column: str) -> pd.DataFrame:
+def two_groups(values: Floats, control: Floats) -> tuple[float, float, float, float]:
+    """The difference of two means by Welch's test, the ends of its interval, and the p value."""
+    test = stats.ttest_ind(values, control, equal_var=False)
+    low, high = test.confidence_interval(CONFIDENCE)
+    return float(values.mean() - control.mean()), float(low), float(high), float(test.pvalue)
+
+
+def paired_differences(
+    rows: pd.DataFrame, baseline: str, column: str, *, as_groups: bool = False
+) -> pd.DataFrame:
     """A row a task, agent and curriculum: it minus the baseline, over the two or more seeds with both."""
     wide = rows.pivot(index=["task", "agent", "seed"], columns="method", values=column)
     found = []
     for method in wide.columns.drop(baseline):
         pairs = wide[[method, baseline]].dropna()
         for (task, agent), pair in pairs.groupby(level=["task", "agent"]):
-            each = (pair[method] - pair[baseline]).to_numpy()
-            if len(each) > 1:
-                found.append((task, agent, method, len(each), *paired(each)))
+            ours, theirs = pair[method].to_numpy(), pair[baseline].to_numpy()
+            if len(pair) > 1:
+                test = two_groups(ours, theirs) if as_groups else paired(ours - theirs)
+                found.append((task, agent, method, len(pair), *test))
     table = pd.DataFrame(found, columns=["task", "agent", "method", "n", column, "low", "high", "p"])
     table = table.sort_values(["task", "agent", "method"])
     return table.assign(p_holm=holm(table["p"].to_numpy()))
@@ -114,14 +124,17 @@ def main() -> None:
     control_options = parser.add_mutually_exclusive_group(required=True)
     control_options.add_argument("--control", type=Path, nargs="+")
     control_options.add_argument("--against", metavar="CURRICULUM")
+    parser.add_argument("--groups", action="store_true", help="with --against: two groups (Welch), not pairs")
     parser.add_argument("--policy", default="stochastic")
     parser.add_argument("--limit", type=float, default=math.inf, help="of the cost; default: none")
     arguments = parser.parse_args()
     rows = read(arguments.tables, arguments.policy, arguments.limit)
     if arguments.against is not None:
         for column in ("return", "cost"):
-            print(f"{column}: paired difference, 95% interval, p, p corrected for all rows")
-            print(paired_differences(rows, arguments.against, column).round(3).to_string(index=False))
+            how = "difference of two groups" if arguments.groups else "paired difference"
+            table = paired_differences(rows, arguments.against, column, as_groups=arguments.groups)
+            print(f"{column}: {how}, 95% interval, p, p corrected for all rows")
+            print(table.round(3).to_string(index=False))
         return
     control = read(arguments.control, arguments.policy, arguments.limit)
     rows = rows[rows["task"].isin(control["task"])]

@@ -60,8 +60,9 @@ def write_rows_and_tests() -> None:
         ]
     )
     tests = [
-        f"{scripts}/differences.py {tables} --against none --policy {policy}"
+        f"{scripts}/differences.py {tables} --against none{how} --policy {policy}"
         for tables in ("table.csv", f"{PILOT} table.csv")
+        for how in ("", " --groups")
         for policy in POLICIES
     ]
     (RESULTS / "table-differences.txt").write_text(transcript(tests))

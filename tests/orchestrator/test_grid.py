@@ -499,7 +499,7 @@ SHIPPED = {
     "safety-gym-curricula": 54,
     "safety-gym-table": 90,
     "safety-gym-level1": 54,
-    "safety-gym-controls": 27,
+    "safety-gym-controls": 18,
     "safety-gym-paper-preset": 18,
     "velocity": 180,
     "velocity-curricula": 180,
