@@ -126,6 +126,7 @@ def test_a_failed_trial_keeps_no_secret_of_an_error(tmp_path: Path) -> None:
     assert done.returncode == ExitCode.WRONG_INPUT
     assert done.stderr.splitlines()[0] == (
         r"grid.yaml:15: tasks.0: leaky:make cannot be built: RuntimeError: no http://***@host and \x1b[31m"
+        " (leaky.py, line 2, in make)"
     )
 
 
