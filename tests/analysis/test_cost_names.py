@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from collections.abc import Callable
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.cost_names import cost_names, cost_suffix, indices_of_cost
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.report import table_formats, verdict_texts
+from recrl.analysis.report import drawing, table_formats, verdict_texts
 from recrl.analysis.statistics import cumulative_cost, metrics
 from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.cli.result_table import result_table
@@ -125,3 +126,10 @@ def test_the_only_cost_has_the_index_0(finished: Sweep) -> None:
     assert set(indices_of_cost(finished, "0").values()) == {0}
     with pytest.raises(ValueError, match=r" has only the cost 0, got '1'$"):
         indices_of_cost(finished, "1")
+
+
+def test_a_name_from_an_export_is_no_markup_in_the_report(two: Sweep, tmp_path: Path) -> None:
+    drawing.sketch(named(two, ["<img src=x>", "[a](b)"]), tmp_path)
+    headings = [line for line in (tmp_path / "report.md").read_text().splitlines() if line[:1] == "#"]
+    assert any("img src=x" in line for line in headings)
+    assert not any("<img" in line or "[a](b)" in line for line in headings)

@@ -1,12 +1,12 @@
 """Judge the confirmation on CarButton2 by the rule in results/safety-gym/button-confirm.yaml.
 
     python -m tests.benchmarks.button_confirm results/safety-gym/button-confirm.csv \
-        --earlier results/safety-gym/curricula-today.csv
+        --earlier results/safety-gym/curricula-today.csv results/safety-gym/table.csv
 
 The tables are those of ``final_policies.py``. Prints whether each pair earns more under ``linear``, and
 whether its mean cost is at most 25 plus one standard error, over seeds or over all episodes, whichever is
 larger. Then come the differences in return and cost, with 95% intervals, paired (Student) and as two groups
-(Welch), of these seeds and of these with the earlier ones.
+(Welch), of these seeds, of these with the first earlier table, and of all.
 """
 
 from __future__ import annotations
@@ -67,13 +67,14 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("fresh", type=Path)
-    parser.add_argument("--earlier", type=Path, required=True)
+    parser.add_argument("--earlier", type=Path, nargs="+", required=True)
     given = parser.parse_args()
-    fresh, earlier = pd.read_csv(given.fresh), pd.read_csv(given.earlier)
+    fresh = pd.read_csv(given.fresh)
+    tables = [fresh, *map(pd.read_csv, given.earlier)]
     print("\n".join(verdict(fresh)))
     for policy in ("stochastic", "deterministic"):
-        for rows in (fresh, pd.concat([earlier, fresh])):
-            seeds = pairs(rows, policy)
+        for number in range(len(tables)):
+            seeds = pairs(pd.concat(tables[: number + 1]), policy)
             print(f"{policy}, linear minus none, seeds {', '.join(map(str, seeds.index))}:")
             print("\n".join(intervals(seeds)))
 

@@ -26,11 +26,11 @@ def periods(updates: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Return the updates of each period, by its name."""
     phase = updates[updates["phase"] == "deployment"]
     ends = phase.groupby(KEYS, observed=True)["end_step"]
-    step = updates.groupby(KEYS, observed=True)["end_step"].transform("min").loc[phase.index]  # of an update
-    begin, end = ends.transform("min") - step, ends.transform("max")
+    of_update = updates.groupby(KEYS, observed=True)["end_step"].transform("min").loc[phase.index]
+    begin, end = ends.transform("min") - of_update, ends.transform("max")
     return {
         "phase": phase,
-        "first": phase[phase["end_step"] - step < begin + STEPS],
+        "first": phase[phase["end_step"] - of_update < begin + STEPS],
         "last": phase[phase["end_step"] > end - STEPS],
     }
 

@@ -1,10 +1,10 @@
-"""Draw what is on the page of the Safety Gym table again, from the files in results/safety-gym.
+"""Draw the pages on relaxed limits and on the Safety Gym table again, from the files in results/safety-gym.
 
     python -m tests.benchmarks.safety_gym_table
 
 From table.zip come the rows of final policies and of the deployment phase, the differences from ``none``,
 the claims and the figures; from these rows and those of other experiments the power. Printed are the rows of
-which the page's tables are made.
+which the pages' tables are made.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import Any
 import pandas as pd
 from PIL import Image
 
+import recrl
 from recrl.orchestrator.cli.main import main as recrl_sweep
 from tests.benchmarks.differences import paired_differences
 from tests.benchmarks.velocity_table import Cell, number
@@ -57,6 +58,9 @@ def write_rows_and_tests() -> None:
         [
             f"{scripts}/final_policies.py table.zip --to table.csv",
             f"{scripts}/deployment_phase.py table.zip --to table-deployment-phase.csv",
+            f"{scripts}/final_policies.py step.zip --to step.csv",
+            f"{scripts}/deployment_phase.py step.zip --to step-deployment-phase.csv",
+            f"{scripts}/final_policies.py button-confirm.zip --to button-confirm.csv",
         ]
     )
     tests = [
@@ -73,6 +77,9 @@ def write_rows_and_tests() -> None:
         for tests in ("", " --tests 24")
     ]
     (RESULTS / "power.txt").write_text(transcript(powers, ROOT))
+    earlier = f"results/safety-gym/{PILOT} results/safety-gym/table.csv"
+    confirm = f"-m tests.benchmarks.button_confirm results/safety-gym/button-confirm.csv --earlier {earlier}"
+    (RESULTS / "button-confirm.txt").write_text(transcript([confirm], ROOT))
 
 
 def draw() -> None:
@@ -92,21 +99,51 @@ def policy_table(rows: pd.DataFrame) -> Iterator[str]:
     seeds = sorted(rows["seed"].unique())
     yield "| task | agent | policy | curriculum | " + " | ".join(f"seed {it}" for it in seeds) + " | mean |"
     yield "|---" * (5 + len(seeds)) + "|"
-    for (task, agent), of_agent in rows.groupby(["task", "agent"], sort=False):
-        for policy in POLICIES:
-            for method in CURRICULA:
-                group = of_agent[(of_agent["policy"] == policy) & (of_agent["method"] == method)]
-                if len(group):
-                    cell = Cell.of(str(task), str(agent), group)
-                    of_seed = group.set_index("seed")[["return", "cost"]]
-                    each = [
-                        f"{of_seed.loc[it, 'return']:.1f} / {of_seed.loc[it, 'cost']:.1f}"
-                        if it in of_seed.index
-                        else ""
-                        for it in seeds
-                    ]
-                    mean = f"{cell.interval} / {cell.costs.replace('+-', '±')}"
-                    yield f"| {task} | `{agent}` | {policy} | `{method}` | {' | '.join(each)} | {mean} |"
+    ordered = rows.assign(
+        policy=pd.Categorical(rows["policy"], POLICIES), method=pd.Categorical(rows["method"], CURRICULA)
+    )
+    keys = ["task", "agent", "policy", "method"]
+    for (task, agent, policy, method), group in ordered.groupby(keys, observed=True):
+        cell = Cell.of(str(task), str(agent), group)
+        of_seed = group.set_index("seed")[["return", "cost"]].map("{:.1f}".format).agg(" / ".join, axis=1)
+        mean = f"{cell.interval} / {cell.costs.replace('+-', '±')}"
+        each = [str(text) for text in of_seed.reindex(seeds, fill_value="")]
+        yield f"| {task} | `{agent}` | {policy} | `{method}` | {' | '.join([*each, mean])} |"
+
+
+def answer_table(rows: pd.DataFrame) -> Iterator[str]:
+    """Yield the lines of the table of answers: stochastic policies under three curricula, and differences."""
+    stochastic = rows[rows["policy"] == "stochastic"]
+    differences = paired_differences(stochastic, "none", "return")
+    texts = {(row["task"], row["method"]): shown(row) for _, row in differences.iterrows()}
+    for task, of_task in stochastic.groupby("task"):
+        cells = [mean_cell(of_task, method) for method in ("none", "linear", "dynamic")]
+        compared = [texts[str(task), method] for method in ("linear", "dynamic")]
+        yield f"| {task} | {of_task['seed'].nunique()} | {' | '.join([*cells, *compared])} |"
+
+
+def mean_cell(rows: pd.DataFrame, method: str) -> str:
+    """Return the mean return / cost of one task and agent under a curriculum."""
+    cell = Cell.of("", "", rows[rows["method"] == method])
+    return f"{cell.episode_return:.1f} / {cell.costs.replace('+-', '±')}"
+
+
+def late_limit_table(final: pd.DataFrame, phase: pd.DataFrame, updates: pd.DataFrame) -> Iterator[str]:
+    """Yield the lines of the table of ``step``: deployment phase, final policies, multipliers."""
+    deployed = updates[updates["phase"] == "deployment"]
+    for task in ("CarGoal2", "CarButton2"):
+        for method in ("none", "linear", "step"):
+            of_phase, of_final, run = (
+                rows[(rows["task"] == task) & (rows["method"] == method)] for rows in (phase, final, deployed)
+            )
+            means = of_phase.loc[of_phase["policy"] == "phase", ["return", "cost"]].mean()
+            multipliers = run.groupby("seed")["multiplier_0"].agg(["first", "last"]).mean()
+            cells = [
+                f"{means['return']:.1f} / {means['cost']:.1f}",
+                mean_cell(of_final[of_final["policy"] == "stochastic"], method),
+                f"{multipliers['first']:.2f}, {multipliers['last']:.2f}",
+            ]
+            yield f"| {task} | `{method}` | {' | '.join(cells)} |"
 
 
 def shown(row: pd.Series[Any]) -> str:
@@ -149,7 +186,16 @@ def main() -> None:
     draw()
     fresh, seen = (pd.read_csv(RESULTS / name) for name in ("table.csv", PILOT))
     phase = pd.read_csv(RESULTS / "table-deployment-phase.csv")
-    for table in (policy_table(fresh), difference_table(fresh, seen), phase_table(phase)):
+    updates = pd.concat(recrl.load_sweep(RESULTS / name).updates for name in ("table.zip", "step.zip"))
+    step, step_phase = (pd.read_csv(RESULTS / name) for name in ("step.csv", "step-deployment-phase.csv"))
+    tables = (
+        policy_table(fresh),
+        difference_table(fresh, seen),
+        phase_table(phase),
+        answer_table(pd.concat([seen, fresh])),
+        late_limit_table(pd.concat([fresh, step]), pd.concat([phase, step_phase]), updates),
+    )
+    for table in tables:
         print("\n" + "\n".join(table))
 
 

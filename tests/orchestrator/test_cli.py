@@ -917,6 +917,8 @@ def test_evaluate_shows_what_it_could_evaluate(
     assert any(line.startswith("Episodes") for line in lines)
     assert "left out   no luck" in lines
     assert main(["evaluate", "small", "--only", "method=linear"]) == ExitCode.WRONG_INPUT
+    assert main(["evaluate", "small", "nobody", "--only", "seed=0"]) == ExitCode.WRONG_INPUT
+    assert "no trials on disk begin with 'nobody'" in capsys.readouterr().err  # not that seed 0 is missing
 
 
 def test_evaluate_leaves_out_trials_that_the_grid_no_longer_has(

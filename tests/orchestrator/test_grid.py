@@ -78,6 +78,7 @@ def test_ten_mistakes_give_ten_located_sentences() -> None:
     ("old", "new", "problem"),
     [
         ("name: small", "nmae: small", "1: nmae: unknown key; did you mean 'name'?"),
+        ("name: small", "NAME: small", "1: NAME: unknown key; did you mean 'name'?"),
         ("seeds: 2", "sedes: [0]", "5: sedes: unknown key; did you mean 'seeds'?"),
         ("tasks: [{", "task: [{", "2: task: unknown key; did you mean 'tasks'?"),
         ("agents: [", "agent: [", "3: agent: unknown key; did you mean 'agents'?"),
