@@ -14,9 +14,9 @@ from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import UntrustedGridError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.files.trial_warnings import no_deployment_sentence, unknown_horizon_sentence
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
+from recrl.orchestrator.grid.grid_warnings import grid_warnings
 from recrl.orchestrator.grid.only_selection import parse_only
 from recrl.orchestrator.launch_grid import room
 from recrl.orchestrator.launch_plan import Plan, TrialSelection, estimate, kind_of, make_plan, unmeasured
@@ -114,9 +114,7 @@ def say_plan(
 
 def _warn_of_steps(grid: GridSpec, specs: Sequence[TrialSpec], console: Console) -> None:
     """Print the warnings about tasks of unknown horizon and about trials without a deployment phase."""
-    endless = [cell.task.label for cell in grid.tasks if cell.horizon is None]
-    sentences = (unknown_horizon_sentence(endless), no_deployment_sentence(specs))
-    for sentence in filter(None, sentences):
+    for sentence in grid_warnings(grid, specs):
         say(console, f"warning: {sentence}")
 
 

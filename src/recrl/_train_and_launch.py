@@ -8,7 +8,8 @@ import re
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid, read_grid
+from recrl.orchestrator.grid.grid_warnings import grid_warnings
 from recrl.orchestrator.spec import TrialStatus
 
 if TYPE_CHECKING:
@@ -55,6 +57,9 @@ def validate(grid: Grid, *, trust: bool = False) -> GridSpec:
         GridError: one sentence for each mistake, also in ``problems``.
         RecrlError: no mistake was found, but an import path was not followed; see ``trust``.
 
+    Warns:
+        UserWarning: a task does not say how long an episode may be, or no update falls into deployment.
+
     Example:
         >>> import recrl
         >>> grid = {"name": "g", "tasks": [{"name": "two-state", "deploy_limits": 2}], "agents": ["cpo"],
@@ -63,7 +68,9 @@ def validate(grid: Grid, *, trust: bool = False) -> GridSpec:
         3
     """
     with following(trust):
-        return _checked(grid, build=True)
+        checked = _checked(grid, build=True)
+    _warn(grid_warnings(checked, checked.trials()))
+    return checked
 
 
 def launch(
@@ -101,8 +108,13 @@ def launch(
             cannot be used.
         KeyboardInterrupt: Ctrl-C, SIGTERM or ``recrl-sweep stop`` stopped it before its end; the same call
             continues.
+
+    Warns:
+        UserWarning: without ``progress``, which prints them: as ``validate`` does, and of curricula that had
+            no effect or ended far above d_d.
     """
     # of the command line only what prints is used
+    from recrl.analysis.data.sweep_warnings import curriculum_warnings  # noqa: PLC0415
     from recrl.orchestrator.cli.launch import launch_and_print  # noqa: PLC0415
     from recrl.orchestrator.cli.output import TextConsole  # noqa: PLC0415
     from recrl.orchestrator.launch_grid import LaunchOptions, launch_grid  # noqa: PLC0415
@@ -125,11 +137,24 @@ def launch(
             given = ("launch", str(grid) if isinstance(grid, str | Path) else "GRID.yaml")
             stopped = launch_and_print(checked, options, TextConsole(), given=given) is ExitCode.STOPPED
         else:
+            _warn(grid_warnings(checked, checked.trials()))
             result = launch_grid(checked, options).result
             stopped = result.stopped and not result.progress.is_complete
         if stopped:
             raise KeyboardInterrupt
-        return load_sweep(Path(root) / checked.name, trust=True)
+        sweep = load_sweep(Path(root) / checked.name, trust=True)
+        if not progress:
+            _warn(curriculum_warnings(sweep))
+        return sweep
+
+
+def _warn(sentences: Iterable[str]) -> None:
+    """Warn of each sentence, at the line that called recrl."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_globals["__name__"].startswith("recrl."):
+        level, frame = level + 1, frame.f_back
+    for sentence in sentences:
+        warnings.warn(sentence, stacklevel=level)
 
 
 def train(
@@ -173,6 +198,9 @@ def train(
         RecrlError: the trial failed, and its traceback is a note of the error; or the disk cannot be used.
         KeyboardInterrupt: Ctrl-C or SIGTERM stopped it before its end; with a ``folder`` the same call
             continues.
+
+    Warns:
+        UserWarning: as ``launch`` does.
 
     Example:
         >>> import recrl

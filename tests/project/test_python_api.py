@@ -35,11 +35,14 @@ GRID = {
     "seeds": 1,
     "run": {**RUN, "evaluation_episodes": 2},
 }
+# the curriculum of two updates lands hard
+pytestmark = pytest.mark.filterwarnings("ignore:hard landing:UserWarning")
 OWN_TASK = """\
 import gymnasium
 import numpy as np
 
 class Room(gymnasium.Env):
+    horizon = 5
     observation_space = gymnasium.spaces.Dict({"at": gymnasium.spaces.Box(0.0, 9.0, (2,), np.float32)})
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
     def reset(self, *, seed=None, options=None):
@@ -504,6 +507,20 @@ def test_validate_takes_a_file_or_a_dictionary(folder: Path) -> None:
     with pytest.raises(recrl.GridError) as error:
         recrl.validate({**GRID, "agents": ["cpx"], "seeds": 0})
     assert len(error.value.problems) == 2
+
+
+def test_what_the_command_prints_as_warnings_are_warnings_of_the_calling_line(folder: Path) -> None:
+    with pytest.warns(UserWarning, match="the deployment phase is shorter than an update") as found:
+        recrl.validate({**GRID, "run": {**RUN, "deploy_fraction": 0.1}})
+    assert {it.filename for it in found} == {__file__}
+    (folder / "endless.py").write_text(OWN_TASK.replace("    horizon = 5\n", ""))
+    with pytest.warns(UserWarning, match="unknown horizon") as found:
+        train(task="endless:make", deploy_limits=3)
+    assert {it.filename for it in found} == {__file__}
+    with pytest.warns(UserWarning, match="hard landing"):
+        train(method="linear", folder="one")
+    with pytest.warns(UserWarning, match="the measured d_t is not above d_d"):
+        train(method="linear", deploy_limits=1000)
 
 
 def test_a_launch_prints_what_the_command_prints(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
