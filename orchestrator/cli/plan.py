@@ -16,17 +16,12 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
-from recrl.orchestrator.grid.grid_warnings import grid_warnings
 from recrl.orchestrator.grid.only_selection import parse_only
 from recrl.orchestrator.launch_grid import room
 from recrl.orchestrator.launch_plan import Plan, TrialSelection, estimate, kind_of, make_plan, unmeasured
-from recrl.orchestrator.provenance.code_changes import (
-    missing_modules_sentence,
-    other_code_sentence,
-    other_versions_sentence,
-)
+from recrl.orchestrator.launch_warnings import code_warnings, grid_warnings
 from recrl.orchestrator.remote.remote_sweep import sweep_place
-from recrl.orchestrator.spec import TrialSpec, TrialStatus
+from recrl.orchestrator.spec import TrialSpec
 
 
 def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
@@ -120,12 +115,5 @@ def _warn_of_steps(grid: GridSpec, specs: Sequence[TrialSpec], console: Console)
 
 def say_other_code(plan: Plan, console: Console) -> None:
     """Print the numbers of trials that ran other code or libraries than now, or code that is not found."""
-    changed = plan.other_code
-    complete = sum(trial.record.status is TrialStatus.COMPLETE for trial in changed)
-    sentences = (
-        other_code_sentence(complete, len(changed) - complete),
-        missing_modules_sentence(plan.missing_modules),
-        other_versions_sentence(plan.other_versions),
-    )
-    for sentence in filter(None, sentences):
+    for sentence in code_warnings(plan):
         say(console, f"warning: {sentence}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import logging
 import re
@@ -10,7 +11,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -25,7 +26,9 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid, read_grid
-from recrl.orchestrator.grid.grid_warnings import grid_warnings
+from recrl.orchestrator.launch_grid import LaunchListener, LaunchOptions, launch_grid
+from recrl.orchestrator.launch_plan import Plan
+from recrl.orchestrator.launch_warnings import code_warnings, grid_warnings, left_out_sentence
 from recrl.orchestrator.spec import TrialStatus
 
 if TYPE_CHECKING:
@@ -110,14 +113,13 @@ def launch(
             continues.
 
     Warns:
-        UserWarning: without ``progress``, which prints them: as ``validate`` does, and of curricula that had
-            no effect or ended far above d_d.
+        UserWarning: without ``progress``, which prints them: as ``validate`` does; trials ran other code, or
+            the grid no longer has them; a curriculum had no effect or ended far above d_d.
     """
     # of the command line only what prints is used
     from recrl.analysis.data.sweep_warnings import curriculum_warnings  # noqa: PLC0415
     from recrl.orchestrator.cli.launch import launch_and_print  # noqa: PLC0415
     from recrl.orchestrator.cli.output import TextConsole  # noqa: PLC0415
-    from recrl.orchestrator.launch_grid import LaunchOptions, launch_grid  # noqa: PLC0415
 
     if executor not in ("ray", "inline"):
         raise RecrlError(f"executor: must be 'ray' or 'inline', got {executor!r}")
@@ -137,8 +139,7 @@ def launch(
             given = ("launch", str(grid) if isinstance(grid, str | Path) else "GRID.yaml")
             stopped = launch_and_print(checked, options, TextConsole(), given=given) is ExitCode.STOPPED
         else:
-            _warn(grid_warnings(checked, checked.trials()))
-            result = launch_grid(checked, options).result
+            result = launch_grid(checked, options, _Warner(checked)).result
             stopped = result.stopped and not result.progress.is_complete
         if stopped:
             raise KeyboardInterrupt
@@ -148,13 +149,25 @@ def launch(
         return sweep
 
 
+class _Warner(LaunchListener):
+    """Listener that warns of what the plan of a launch shows."""
+
+    def __init__(self, grid: GridSpec) -> None:
+        self._grid = grid
+
+    def planned(self, plan: Plan, *, at_once: int, where: str) -> AbstractContextManager[None]:
+        """Warn before the first trial."""
+        sentences = (*grid_warnings(self._grid, plan.to_do), *code_warnings(plan), left_out_sentence(plan))
+        _warn(filter(None, sentences))
+        return nullcontext()
+
+
 def _warn(sentences: Iterable[str]) -> None:
     """Warn of each sentence, at the line that called recrl."""
-    level, frame = 1, sys._getframe()
-    while frame.f_back is not None and frame.f_globals["__name__"].startswith("recrl."):
-        level, frame = level + 1, frame.f_back
+    modules = [str(it.frame.f_globals.get("__name__")) for it in inspect.stack(0)]
+    ours = [depth for depth, name in enumerate(modules, 1) if name.startswith("recrl.")]
     for sentence in sentences:
-        warnings.warn(sentence, stacklevel=level)
+        warnings.warn(sentence, stacklevel=max(ours) + 1)
 
 
 def train(

@@ -519,6 +519,11 @@ def test_what_the_command_prints_as_warnings_are_warnings_of_the_calling_line(fo
     assert {it.filename for it in found} == {__file__}
     with pytest.warns(UserWarning, match="hard landing"):
         train(method="linear", folder="one")
+    with pytest.warns(
+        UserWarning, match="no longer in the grid: 1 trial, kept on disk and left out"
+    ) as found:
+        train(folder="one", seed=1)
+    assert {it.filename for it in found} == {__file__}
     with pytest.warns(UserWarning, match="the measured d_t is not above d_d"):
         train(method="linear", deploy_limits=1000)
 
