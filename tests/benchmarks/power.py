@@ -5,7 +5,8 @@
 The spread is the standard deviation s of the returns of final policies of one agent and curriculum on a task,
 over seeds and repetitions, pooled over agents and curricula. For n seeds of each of two curricula the table
 has the smallest true difference that a t test at 5% finds with a probability of 80%. With ``--tests N`` the
-level is 5% / N (Bonferroni). The trials count as independent. The power is exact, from the noncentral t
+level is 5% / N (Bonferroni). With ``--difference D`` the last column has the seeds that find a true
+difference D. The trials count as independent. The power is exact, from the noncentral t
 distribution.
 """
 
@@ -18,7 +19,7 @@ import pandas as pd
 from scipy import optimize, stats
 
 POWER = 0.8
-SEEDS = (3, 5, 10, 20)
+SEEDS = (3, 5, 6, 10, 20)
 
 
 def power(difference: float, seeds: int, level: float) -> float:
@@ -39,6 +40,14 @@ def detectable(seeds: int, level: float) -> float:
     return float(optimize.brentq(lambda difference: power(difference, seeds, level) - POWER, 0.0, reach))
 
 
+def seeds_for(difference: float, level: float) -> int:
+    """Return the smallest number of seeds that finds a difference, in standard deviations, above 0."""
+    seeds = 2
+    while power(difference, seeds, level) < POWER:
+        seeds += 1
+    return seeds
+
+
 def pooled(returns: pd.DataFrame) -> tuple[float, int]:
     """Return the standard deviation, pooled over groups, and its degrees of freedom."""
     groups = returns.groupby(["agent", "method"])["return"]
@@ -52,6 +61,7 @@ def main() -> None:
     parser.add_argument("tables", nargs="+", help="CSV files of final policies")
     parser.add_argument("--agents", nargs="+", metavar="LABEL", help="default: all")
     parser.add_argument("--tests", type=int, default=1, help="the number of tests; default: 1")
+    parser.add_argument("--difference", type=float, metavar="D", help="of two mean returns, above 0")
     given = parser.parse_args()
     level = 0.05 / given.tests
     read = pd.concat([pd.read_csv(path) for path in given.tables], ignore_index=True)
@@ -61,11 +71,13 @@ def main() -> None:
     units = {seeds: detectable(seeds, level) for seeds in SEEDS}
     print("differences in standard deviations:")
     print("  ", ", ".join(f"{unit:.2f} with {seeds} seeds" for seeds, unit in units.items()))
-    print(f"{'task':14}{'s':>7}{'(degrees)':>11}" + "".join(f"{seeds:>4} seeds" for seeds in SEEDS))
+    last = f"{f'for {given.difference:g}':>12}" if given.difference else ""
+    print(f"{'task':14}{'s':>7}{'(degrees)':>11}" + "".join(f"{seeds:>4} seeds" for seeds in SEEDS) + last)
     for task, returns in rows.groupby("task"):
         spread, degrees = pooled(returns)
         shown = "".join(f"{spread * unit:>10.1f}" for unit in units.values())
-        print(f"{task:14}{spread:7.2f}{degrees:11}" + shown)
+        last = f"{seeds_for(given.difference / spread, level):>12}" if given.difference else ""
+        print(f"{task:14}{spread:7.2f}{degrees:11}" + shown + last)
 
 
 if __name__ == "__main__":

@@ -3,8 +3,8 @@
     python -m tests.benchmarks.safety_gym_table
 
 From table.zip come the rows of final policies and of the deployment phase, the differences from ``none``,
-the claims and the figures; from these rows and those of other experiments the power. Printed are the rows of
-which the pages' tables are made.
+the claims and the figures; from these rows and those of other experiments the power. The controls and the
+confirmation have their own archives. Printed are the rows of which the pages' tables are made.
 """
 
 from __future__ import annotations
@@ -28,17 +28,18 @@ from tests.benchmarks.velocity_table import Cell, number
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results" / "safety-gym"
 COLOURS = 128  # of a figure in the documentation
-CURRICULA = ("none", "linear", "cosine", "exponential", "dynamic")
+ARCHIVES = ("table", "controls", "early-landing", "short-training")  # with rows of the deployment phase
+STEPS_UNDER_LIMIT = ("none", "none-short", "linear", "linear-early")  # differ in these on CarGoal2
+NOISE = ("none", "dynamic", "dynamic-without-noise")
+CURRICULA = (*STEPS_UNDER_LIMIT, "cosine", "exponential", *NOISE[1:], "step")
 PERIODS = ("phase", "first", "last")
 POLICIES = ("stochastic", "deterministic")
-PILOT = "curricula-today.csv"
-COUNTED = (
-    "agents.csv",
-    PILOT,
-    "margin-control.csv",
-    "table.csv",
-    "button-confirm.csv",
-)  # for the spread of ppo-lag
+LOW_LIMIT = 50.0  # twice the limit of deployment
+PERIOD = 250_000  # steps, of a curve
+AGENTS = ("ppo-lag", "cpo")
+LABELS = ("ppo-lag min-std", "cpo")  # of each agent in the tables for the power
+PILOT = ("curricula-today.csv", "cpo-curricula.csv")
+COUNTED = ("agents.csv", *PILOT, "margin-control.csv", "table.csv", "button-confirm.csv")  # for the power
 
 
 def transcript(commands: Sequence[str], folder: Path = RESULTS) -> str:
@@ -56,28 +57,25 @@ def write_rows_and_tests() -> None:
     scripts = "../../tests/benchmarks"
     transcript(
         [
-            f"{scripts}/final_policies.py table.zip --to table.csv",
-            f"{scripts}/deployment_phase.py table.zip --to table-deployment-phase.csv",
-            f"{scripts}/final_policies.py step.zip --to step.csv",
-            f"{scripts}/deployment_phase.py step.zip --to step-deployment-phase.csv",
-            f"{scripts}/final_policies.py button-confirm.zip --to button-confirm.csv",
+            *(f"{scripts}/final_policies.py {it}.zip --to {it}.csv" for it in (*ARCHIVES, "button-confirm")),
+            *(f"{scripts}/deployment_phase.py {it}.zip --to {it}-deployment-phase.csv" for it in ARCHIVES),
         ]
     )
     tests = [
         f"{scripts}/differences.py {tables} --against none{how} --policy {policy}"
-        for tables in ("table.csv", f"{PILOT} table.csv")
+        for tables in ("table.csv", f"{' '.join(PILOT)} table.csv")
         for how in ("", " --groups")
         for policy in POLICIES
     ]
     (RESULTS / "table-differences.txt").write_text(transcript(tests))
     tables = " ".join(f"results/safety-gym/{name}" for name in COUNTED)
     powers = [
-        f"tests/benchmarks/power.py {tables}{tests}"
-        for tables in (tables, "results/safety-gym/cpo-curricula.csv")
-        for tests in ("", " --tests 24")
+        f"tests/benchmarks/power.py {tables} --agents {labels} --tests {tests} --difference 1"
+        for labels in LABELS
+        for tests in (1, 14, 24)  # those of the answer page, and of the paper's table
     ]
     (RESULTS / "power.txt").write_text(transcript(powers, ROOT))
-    earlier = f"results/safety-gym/{PILOT} results/safety-gym/table.csv"
+    earlier = f"results/safety-gym/{PILOT[0]} results/safety-gym/table.csv"
     confirm = f"-m tests.benchmarks.button_confirm results/safety-gym/button-confirm.csv --earlier {earlier}"
     (RESULTS / "button-confirm.txt").write_text(transcript([confirm], ROOT))
 
@@ -112,14 +110,48 @@ def policy_table(rows: pd.DataFrame) -> Iterator[str]:
 
 
 def answer_table(rows: pd.DataFrame) -> Iterator[str]:
-    """Yield the lines of the table of answers: stochastic policies under three curricula, and differences."""
-    stochastic = rows[rows["policy"] == "stochastic"]
-    differences = paired_differences(stochastic, "none", "return")
-    texts = {(row["task"], row["method"]): shown(row) for _, row in differences.iterrows()}
-    for task, of_task in stochastic.groupby("task"):
-        cells = [mean_cell(of_task, method) for method in ("none", "linear", "dynamic")]
-        compared = [texts[str(task), method] for method in ("linear", "dynamic")]
-        yield f"| {task} | {of_task['seed'].nunique()} | {' | '.join([*cells, *compared])} |"
+    """Yield the lines of the table of answers: stochastic policies, and differences from none."""
+    ordered = rows.assign(agent=pd.Categorical(rows["agent"], AGENTS))
+    stochastic = ordered[ordered["policy"] == "stochastic"]
+    differences = paired_differences(stochastic.astype({"agent": str}), "none", "return")
+    texts = {tuple(row[["agent", "task", "method"]]): shown(row) for _, row in differences.iterrows()}
+    for (agent, task), of_cell in stochastic.groupby(["agent", "task"], observed=True):
+        none = mean_cell(of_cell, "none")
+        yield f"| `{agent}` | {task} | `none` | {seeds_of(of_cell, 'none')} | {none} | |"
+        for method in CURRICULA:
+            if text := texts.get((agent, task, method)):
+                cells = f"{seeds_of(of_cell, method)} | {mean_cell(of_cell, method)}"
+                yield f"| `{agent}` | {task} | `{method}` | {cells} | {text} |"
+
+
+def seeds_of(rows: pd.DataFrame, method: str) -> int:
+    """Return the number of seeds of one task and agent under a curriculum."""
+    return int((rows["method"] == method).sum())
+
+
+def of_question(rows: pd.DataFrame, methods: Sequence[str]) -> pd.DataFrame:
+    """Return the rows of ppo-lag on CarGoal2 under some curricula."""
+    chosen = (rows["task"] == "CarGoal2") & (rows["agent"] == "ppo-lag")
+    return rows[chosen & rows["method"].isin(methods)]
+
+
+def control_differences(rows: pd.DataFrame, baselines: Sequence[str]) -> Iterator[str]:
+    """Yield what policies earn and cost above those of each baseline."""
+    for policy in POLICIES:
+        of_policy = rows[rows["policy"] == policy]
+        for column in ("return", "cost"):
+            for baseline in baselines:
+                table = paired_differences(of_policy, baseline, column).drop(columns="p_holm")
+                yield f"{policy}, {column} above {baseline}, paired by seed: 95% interval, p (not corrected)"
+                yield table.round(3).to_string(index=False)
+
+
+def curve(updates: pd.DataFrame) -> pd.DataFrame:
+    """Return means over the updates of each PERIOD steps, and over seeds; the cost where episodes ended."""
+    begin = (updates["end_step"] - 1) // PERIOD * PERIOD
+    columns = ["episode_return", "cost_0", "limit_0", "multiplier_0"]
+    means = updates.assign(from_step=begin).groupby(["method", "from_step"], observed=True)[columns].mean()
+    return means.round(2).reset_index()
 
 
 def mean_cell(rows: pd.DataFrame, method: str) -> str:
@@ -128,17 +160,24 @@ def mean_cell(rows: pd.DataFrame, method: str) -> str:
     return f"{cell.episode_return:.1f} / {cell.costs.replace('+-', '±')}"
 
 
-def late_limit_table(final: pd.DataFrame, phase: pd.DataFrame, updates: pd.DataFrame) -> Iterator[str]:
-    """Yield the lines of the table of ``step``: deployment phase, final policies, multipliers."""
-    deployed = updates[updates["phase"] == "deployment"]
+def landing_table(
+    final: pd.DataFrame, phase: pd.DataFrame, updates: pd.DataFrame, methods: Sequence[str]
+) -> Iterator[str]:
+    """Yield the lines of a table of ppo-lag: steps under low limits, phase, policies, multipliers."""
+    final, phase, updates = (rows[rows["agent"] == "ppo-lag"] for rows in (final, phase, updates))
     for task in ("CarGoal2", "CarButton2"):
-        for method in ("none", "linear", "step"):
+        for method in methods:
             of_phase, of_final, run = (
-                rows[(rows["task"] == task) & (rows["method"] == method)] for rows in (phase, final, deployed)
+                rows[(rows["task"] == task) & (rows["method"] == method)] for rows in (phase, final, updates)
             )
+            if of_phase.empty:
+                continue
             means = of_phase.loc[of_phase["policy"] == "phase", ["return", "cost"]].mean()
-            multipliers = run.groupby("seed")["multiplier_0"].agg(["first", "last"]).mean()
+            deployed = run[run["phase"] == "deployment"]
+            multipliers = deployed.groupby("seed")["multiplier_0"].agg(["first", "last"]).mean()
+            low = (run["limit_0"] <= LOW_LIMIT).mean() * run["end_step"].max()  # all seeds have as many steps
             cells = [
+                f"{low:,.0f}",
                 f"{means['return']:.1f} / {means['cost']:.1f}",
                 mean_cell(of_final[of_final["policy"] == "stochastic"], method),
                 f"{multipliers['first']:.2f}, {multipliers['last']:.2f}",
@@ -149,7 +188,7 @@ def late_limit_table(final: pd.DataFrame, phase: pd.DataFrame, updates: pd.DataF
 def shown(row: pd.Series[Any]) -> str:
     """Return a difference with its interval and its corrected p value."""
     mean, low, high = (number(row[name]) for name in ("return", "low", "high"))
-    return f"{mean} ({low} to {high}), p = {row['p_holm']:.3f}"
+    return f"{mean} ({low} to {high}), p = {row['p_holm']:.2g}"
 
 
 def difference_table(fresh: pd.DataFrame, seen: pd.DataFrame) -> Iterator[str]:
@@ -184,16 +223,32 @@ def main() -> None:
     """Write the files, and print the page's tables."""
     write_rows_and_tests()
     draw()
-    fresh, seen = (pd.read_csv(RESULTS / name) for name in ("table.csv", PILOT))
-    phase = pd.read_csv(RESULTS / "table-deployment-phase.csv")
-    updates = pd.concat(recrl.load_sweep(RESULTS / name).updates for name in ("table.zip", "step.zip"))
-    step, step_phase = (pd.read_csv(RESULTS / name) for name in ("step.csv", "step-deployment-phase.csv"))
+    finals = [pd.read_csv(RESULTS / f"{name}.csv") for name in ARCHIVES]
+    fresh = finals[0]
+    seen = pd.concat(pd.read_csv(RESULTS / name) for name in PILOT)
+    phases = [pd.read_csv(RESULTS / f"{name}-deployment-phase.csv") for name in ARCHIVES]
+    updates = pd.concat(recrl.load_sweep(RESULTS / f"{name}.zip").updates for name in ARCHIVES)
+    everything = pd.concat(finals), pd.concat(phases), updates
+    by_steps = of_question(pd.concat([seen, *finals]), STEPS_UNDER_LIMIT)
+    by_noise = of_question(everything[0], NOISE)
+    questions = (
+        ("steps-under-limit", by_steps, ("none", "linear")),
+        ("noise", by_noise, ("none", "dynamic")),
+    )
+    for name, rows, baselines in questions:
+        lines = control_differences(rows, baselines)
+        (RESULTS / f"{name}.txt").write_text("\n".join([*lines, ""]))
+    curve(of_question(updates, STEPS_UNDER_LIMIT)).to_csv(
+        RESULTS / "steps-under-limit-curve.csv", index=False
+    )
     tables = (
         policy_table(fresh),
         difference_table(fresh, seen),
-        phase_table(phase),
+        phase_table(phases[0]),
         answer_table(pd.concat([seen, fresh])),
-        late_limit_table(pd.concat([fresh, step]), pd.concat([phase, step_phase]), updates),
+        landing_table(*everything, CURRICULA),
+        policy_table(by_steps),
+        policy_table(by_noise),
     )
     for table in tables:
         print("\n" + "\n".join(table))

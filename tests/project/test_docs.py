@@ -83,6 +83,7 @@ def test_python_in_fences_runs(page: Path, tmp_path: Path, monkeypatch: pytest.M
             exec(compile(fence.text, label(page), "exec"), names)
 
 
+@pytest.mark.filterwarnings("ignore:hard landing:UserWarning")  # of two updates
 def test_python_of_the_readme_runs(
     finished_sweep: SweepStore,
     tmp_path: Path,

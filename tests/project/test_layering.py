@@ -80,7 +80,7 @@ LAYERS = (
     ("executors", "sweep_place", "sweep_progress", "trial"),
     ("grid", "remote"),
     ("find_sweep", "launch_plan", "tracking"),
-    ("ray", "report_refresh", "run_sweep"),
+    ("launch_warnings", "ray", "report_refresh", "run_sweep"),
     ("launch_grid",),
     ("cli",),
 )
