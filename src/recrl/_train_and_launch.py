@@ -116,8 +116,9 @@ def launch(
         UserWarning: without ``progress``, which prints them: as ``validate`` does; trials ran other code, or
             the grid no longer has them; a curriculum had no effect or ended far above d_d.
     """
-    # of the command line only what prints is used
     from recrl.analysis.data.sweep_warnings import curriculum_warnings  # noqa: PLC0415
+
+    # of the command line only what prints is used
     from recrl.orchestrator.cli.launch import launch_and_print  # noqa: PLC0415
     from recrl.orchestrator.cli.output import TextConsole  # noqa: PLC0415
 
@@ -139,7 +140,7 @@ def launch(
             given = ("launch", str(grid) if isinstance(grid, str | Path) else "GRID.yaml")
             stopped = launch_and_print(checked, options, TextConsole(), given=given) is ExitCode.STOPPED
         else:
-            result = launch_grid(checked, options, _Warner(checked)).result
+            result = launch_grid(checked, options, _PlanWarnings(checked)).result
             stopped = result.stopped and not result.progress.is_complete
         if stopped:
             raise KeyboardInterrupt
@@ -149,7 +150,7 @@ def launch(
         return sweep
 
 
-class _Warner(LaunchListener):
+class _PlanWarnings(LaunchListener):
     """Listener that warns of what the plan of a launch shows."""
 
     def __init__(self, grid: GridSpec) -> None:

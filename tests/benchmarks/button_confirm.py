@@ -16,9 +16,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pandas as pd
-from scipy import stats
 
-from tests.benchmarks.differences import paired
+from tests.benchmarks.differences import paired, two_groups
 from tests.benchmarks.velocity_table import Cell
 
 TASK, AGENT, LIMIT = "CarButton2", "ppo-lag", 25.0
@@ -56,8 +55,8 @@ def intervals(seeds: pd.DataFrame) -> Iterator[str]:
     for column in ("return", "cost"):
         linear, none = seeds[column, "linear"].to_numpy(), seeds[column, "none"].to_numpy()
         mean, low, high, _ = paired(linear - none)
-        welch = stats.ttest_ind(linear, none, equal_var=False).confidence_interval()
-        groups = f"Welch {welch.low:.2f} to {welch.high:.2f}"
+        _, welch_low, welch_high, _ = two_groups(linear, none)
+        groups = f"Welch {welch_low:.2f} to {welch_high:.2f}"
         yield f"  {column}: {mean:.2f} (paired {low:.2f} to {high:.2f}; {groups})"
 
 

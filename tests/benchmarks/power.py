@@ -71,13 +71,14 @@ def main() -> None:
     units = {seeds: detectable(seeds, level) for seeds in SEEDS}
     print("differences in standard deviations:")
     print("  ", ", ".join(f"{unit:.2f} with {seeds} seeds" for seeds, unit in units.items()))
-    last = f"{f'for {given.difference:g}':>12}" if given.difference else ""
-    print(f"{'task':14}{'s':>7}{'(degrees)':>11}" + "".join(f"{seeds:>4} seeds" for seeds in SEEDS) + last)
+    needed = f"{f'for {given.difference:g}':>12}" if given.difference else ""
+    print(f"{'task':14}{'s':>7}{'(degrees)':>11}" + "".join(f"{seeds:>4} seeds" for seeds in SEEDS) + needed)
     for task, returns in rows.groupby("task"):
         spread, degrees = pooled(returns)
         shown = "".join(f"{spread * unit:>10.1f}" for unit in units.values())
-        last = f"{seeds_for(given.difference / spread, level):>12}" if given.difference else ""
-        print(f"{task:14}{spread:7.2f}{degrees:11}" + shown + last)
+        known = given.difference and spread > 0.0
+        needed = f"{seeds_for(given.difference / spread, level):>12}" if known else ""
+        print(f"{task:14}{spread:7.2f}{degrees:11}" + shown + needed)
 
 
 if __name__ == "__main__":

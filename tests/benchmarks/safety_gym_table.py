@@ -103,7 +103,7 @@ def policy_table(rows: pd.DataFrame) -> Iterator[str]:
     for (task, agent, policy, method), group in ordered.groupby(keys, observed=True):
         cell = Cell.of(str(task), str(agent), group)
         of_seed = group.set_index("seed")[["return", "cost"]].map("{:.1f}".format).agg(" / ".join, axis=1)
-        mean = f"{cell.interval} / {cell.costs.replace('+-', '±')}"
+        mean = f"{cell.interval} / {costs_of(cell)}"
         each = [str(text) for text in of_seed.reindex(seeds, fill_value="")]
         yield f"| {task} | `{agent}` | {policy} | `{method}` | {' | '.join([*each, mean])} |"
 
@@ -146,7 +146,7 @@ def control_differences(rows: pd.DataFrame, baselines: Sequence[str]) -> Iterato
 
 
 def curve(updates: pd.DataFrame) -> pd.DataFrame:
-    """Return means over the updates of each PERIOD steps, and over seeds; the cost where episodes ended."""
+    """Return means over seeds and over the updates that end in each PERIOD steps, by curriculum."""
     begin = (updates["end_step"] - 1) // PERIOD * PERIOD
     columns = ["episode_return", "cost_0", "limit_0", "multiplier_0"]
     means = updates.assign(from_step=begin).groupby(["method", "from_step"], observed=True)[columns].mean()
@@ -156,7 +156,12 @@ def curve(updates: pd.DataFrame) -> pd.DataFrame:
 def mean_cell(rows: pd.DataFrame, method: str) -> str:
     """Return the mean return / cost of one task and agent under a curriculum."""
     cell = Cell.of("", "", rows[rows["method"] == method])
-    return f"{cell.episode_return:.1f} / {cell.costs.replace('+-', '±')}"
+    return f"{cell.episode_return:.1f} / {costs_of(cell)}"
+
+
+def costs_of(cell: Cell) -> str:
+    """Return the mean cost with its error, for a page."""
+    return cell.costs.replace("+-", "±")
 
 
 def landing_table(
