@@ -35,6 +35,10 @@ TIES = (
     "is known, as for solved; elsewhere only where they differ by rounding."
 )
 SAMPLED = "That standard error is over the episodes of a trial; the one after ± is over seeds."
+CORRECTED_NOTE = (
+    f"{table_formats.CORRECTED}: of a paired t test of the return, corrected for all rows of this table by "
+    "Holm's method."
+)
 FEW = f"{table_formats.TOO_FEW}: with fewer than {ENOUGH_RUNS} seeds this interval is too short."
 SUMS_NOTE = (
     "Sums over the policies of the training phase, one expected episode each; means over n seeds. A policy "
@@ -234,7 +238,13 @@ def _comparison_tables(
         table = table_formats.comparison_table(rows, suffixes)
         marked = table["P(higher return)"].str.contains(table_formats.TOO_FEW).any()
         dashed = bool((rows["feasible_pairs"] < rows["pairs"]).any())
-        notes = [TIES, FEW if marked else "", NO_GAIN if dashed else "", table_formats.not_corrected(table)]
+        notes = [
+            CORRECTED_NOTE if table_formats.CORRECTED in table else "",
+            TIES,
+            FEW if marked else "",
+            NO_GAIN if dashed else "",
+            table_formats.not_corrected(table),
+        ]
         note = " ".join(filter(None, notes))
         tables.append(
             ShownTable(f"{_heading(measure)}, minus none", table, note, table_formats.row_kinds(rows))

@@ -21,6 +21,7 @@ from recrl.orchestrator.files.atomic_files import write_atomically
 from recrl.orchestrator.redaction import printable
 
 TOO_FEW = "†"
+CORRECTED = "p, corrected"
 INTERVAL = re.compile(r"[\[(][^\[\]()]*\d(?:, | to |–)[^\[\]()]*\d%?[\])]")
 LATEX = {
     "\\": r"\textbackslash{}",
@@ -110,17 +111,22 @@ def comparison_table(rows: pd.DataFrame, suffixes: Sequence[str] = ()) -> pd.Dat
     More return is no gain if a policy of a pair is infeasible, with the curriculum or with none. Such a row
     has no gain, only its added cost and the number of feasible pairs.
 
+    Without two seeds of any row the table has no p values.
+
     Args:
         rows: of ``compared_rows``.
         suffixes: as for ``outcome_table``.
     """
     costs = [name for name in map(str, rows) if name.startswith("cost_") and name.endswith("_difference")]
+    any_tested = bool(rows["return_difference_p"].notna().any())
     lines = []
     for _, row in rows.iterrows():
         line = names_of(row) | {"n": str(row["pairs"])}
         no_gain = row["feasible_pairs"] < row["pairs"]
         line["feasible pairs"] = f"{row['feasible_pairs']} of {row['pairs']}"
         line["return gained"] = DASH if no_gain else with_interval(row, "return_difference")
+        if any_tested:
+            line[CORRECTED] = DASH if no_gain else p_value(row["return_difference_p_corrected"])
         for name in costs:
             title = f"cost{_cost_suffix(suffixes, name, len(costs))} added"
             line[title] = with_interval(row, name)
@@ -141,6 +147,17 @@ def with_interval(row: pd.Series, name: str) -> str:
     shown, low, high = (round(value, 2) + 0.0 for value in (estimate, low, high))  # no -0.00
     ends = "" if math.isnan(low) else f" [{low:.2f}, {high:.2f}]"
     return DASH if math.isnan(estimate) else f"{shown:.2f}{ends}"
+
+
+def p_value(value: float) -> str:
+    """Format a p value; empty if there is none.
+
+    >>> p_value(0.0123), p_value(0.4), p_value(3e-7), p_value(math.nan)
+    ('0.012', '0.40', '< 0.001', '')
+    """
+    if math.isnan(value):
+        return ""
+    return "< 0.001" if value < 0.001 else f"{value:.{2 if value >= 0.1 else 3}f}"
 
 
 def not_corrected(table: pd.DataFrame) -> str:

@@ -35,7 +35,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtri, stdtrit  # importing scipy.stats takes a second and a half
+from scipy.special import ndtri, stdtr, stdtrit  # importing scipy.stats takes a second and a half
 
 from recrl.environments.cmdp import Floats
 
@@ -64,6 +64,17 @@ class Interval:
     high: float
     runs: int
     is_small: bool
+
+
+@dataclass(frozen=True)
+class Difference(Interval):
+    """A difference of means, the interval around it, and a test.
+
+    Attributes:
+        p_value: of the two-sided t test that the true difference is 0; NaN where there is no interval.
+    """
+
+    p_value: float
 
 
 def mean_and_standard_error(values: Floats) -> tuple[float, float]:
@@ -184,8 +195,8 @@ def improvement_interval(
     return _percentile_interval(estimate, replicated, min(len(scores), len(others)), CONFIDENCE)
 
 
-def paired_difference(values: Floats, baseline: Floats) -> Interval:
-    """Return the mean difference between runs of equal seeds, with Student's t 95% interval.
+def paired_difference(values: Floats, baseline: Floats) -> Difference:
+    """Return the mean difference between runs of equal seeds, with Student's t 95% interval and test.
 
     Equal seeds share the first policy and the stream of the environment, so that differences within a
     seed vary less than differences between seeds.
@@ -194,7 +205,46 @@ def paired_difference(values: Floats, baseline: Floats) -> Interval:
         values: [n], in the order of the seeds.
         baseline: [n], in the same order.
     """
-    return mean_interval(np.subtract(values, baseline))
+    mean, error = mean_and_standard_error(np.subtract(values, baseline))
+    return _t_test(mean, error, len(values) - 1.0, len(values))
+
+
+def group_difference(values: Floats, baseline: Floats) -> Difference:
+    """Return the difference between the means of two independent groups, with Welch's 95% interval and test.
+
+    The groups may differ in size and in variance. Equal to ``scipy.stats.ttest_ind(equal_var=False)``.
+
+    Args:
+        values: [n].
+        baseline: [n'].
+    """
+    (mean, error), (base, base_error) = map(mean_and_standard_error, (values, baseline))
+    parts = np.array([error, base_error]) ** 2
+    freedom = np.array([len(values), len(baseline)]) - 1
+    squares = float(np.sum(parts**2 / np.maximum(freedom, 1)))
+    degrees = float(np.sum(parts)) ** 2 / squares if squares else float(np.sum(freedom))
+    return _t_test(mean - base, math.sqrt(np.sum(parts)), degrees, min(len(values), len(baseline)))
+
+
+def holm(p_values: Floats) -> Floats:
+    """Return p values corrected for their number by Holm's (1979) method; NaN stays and does not count.
+
+    Args:
+        p_values: [n], each in [0, 1] or NaN.
+
+    Returns:
+        [n]. If each difference with a corrected p below 0.05 is called real, the probability that any of them
+        is not is at most 5%.
+
+    >>> holm(np.array([0.03, 0.01, math.nan, 0.04])).round(2).tolist()
+    [0.06, 0.03, nan, 0.06]
+    """
+    corrected = np.full(len(p_values), math.nan)
+    known = np.flatnonzero(~np.isnan(p_values))
+    order = known[np.argsort(p_values[known], kind="stable")]
+    factors = np.arange(len(order), 0, -1)
+    corrected[order] = np.minimum(np.maximum.accumulate(p_values[order] * factors), 1.0)
+    return corrected
 
 
 def wilson_interval(successes: int, runs: int) -> Interval:
@@ -233,6 +283,18 @@ def share_text(successes: int, runs: int, low: float, high: float) -> str:
     """
     interval = f" ({round(100 * low)}–{round(100 * high)}%)"
     return f"{successes} of {runs}{interval if runs >= ENOUGH_FOR_SHARES else ''}"
+
+
+def _t_test(difference: float, error: float, degrees: float, runs: int) -> Difference:
+    """Return Student's t 95% interval and two-sided test of a difference with a standard error."""
+    if runs < 2:
+        return Difference(difference, math.nan, math.nan, runs, True, math.nan)
+    reach = float(stdtrit(degrees, 0.5 + CONFIDENCE / 2.0)) * error
+    if error == 0.0:
+        p_value = float(difference == 0.0)
+    else:
+        p_value = 2.0 * float(stdtr(degrees, -abs(difference) / error))
+    return Difference(difference, difference - reach, difference + reach, runs, False, p_value)
 
 
 def _resampled(scores: Floats, generator: np.random.Generator, replications: int) -> Floats:

@@ -9,8 +9,10 @@ finite and its table was recorded; otherwise they are means over episodes.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
 from enum import StrEnum
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -19,6 +21,8 @@ from recrl.analysis.data.labels import BASELINE, GROUP, KEY
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.statistics.intervals import (
     Interval,
+    group_difference,
+    holm,
     improvement_interval,
     interquartile_mean,
     mean_and_standard_error,
@@ -198,7 +202,7 @@ def robust_summary(rows: pd.DataFrame, generator: np.random.Generator) -> pd.Dat
 def comparisons(
     rows: pd.DataFrame, generator: np.random.Generator, *, baseline: str = BASELINE
 ) -> pd.DataFrame:
-    """Compare every method with one of them: one row per other GROUP and measure with a common seed.
+    """Compare every method with one of them, paired: one row per other GROUP and measure with a common seed.
 
     All pairs count, feasible or not. More return is a gain only where feasible_pairs equals pairs.
 
@@ -209,50 +213,124 @@ def comparisons(
 
     Returns:
         GROUP, measure, pairs (seeds that both have), feasible_pairs (those whose trials are both feasible);
-        mean paired differences to the baseline with Student's 95% interval: return_difference, _low, _high,
-        and the same for cost_i_difference; then improvement, the probability that a run returns more
-        than a run of the baseline (of these seeds; ties count half: ``verdicts.tie``), with its bootstrap
-        interval _low, _high; and too_few_seeds (that interval is then too short).
+        return_difference, the mean paired difference to the baseline, with Student's 95% interval (_low,
+        _high) and p value (_p; 1 if all pairs tie, ``verdicts.tie``, and NaN for one pair);
+        return_difference_p_corrected, the p value corrected by ``holm`` for all rows of the measure;
+        the same for cost_i_difference; improvement, the probability that a run returns more than a run of
+        the baseline (of these seeds; ties count half), with its bootstrap interval (_low, _high);
+        too_few_seeds (the bootstrap interval is then too short).
 
     Raises:
         ValueError: no row has the given baseline. Without ``none`` the table is empty by default.
     """
-    if baseline != BASELINE and not (rows["method"] == baseline).any():
-        known = ", ".join(map(str, dict.fromkeys(rows["method"])))
-        raise ValueError(f"baseline: no complete trial has the method {baseline!r} (found: {known})")
-    costs = [str(name) for name in rows if is_cost(str(name))]
+    if baseline != BASELINE:
+        _check_label(rows, "method", baseline)
     lines = []
-    for (task, agent, method, measure), chosen in rows.groupby(
-        [*GROUP, "measure"], observed=True, sort=False
-    ):
-        same = (rows["task"] == task) & (rows["agent"] == agent) & (rows["measure"] == measure)
-        others = rows[same & (rows["method"] == baseline)]
-        if method == baseline or not len(others):
-            continue
-        pairs = chosen.merge(others, on="seed", suffixes=("", "_base"))
-        if not len(pairs):
-            continue
-        line: dict[str, Any] = {"task": task, "agent": agent, "method": method, "measure": measure}
-        line |= {
-            "pairs": len(pairs),
-            "feasible_pairs": int((pairs["feasible"] & pairs["feasible_base"]).sum()),
-        }
-        for name, column in (("return", "episode_return"), *((cost, cost) for cost in costs)):
-            difference = paired_difference(
-                pairs[column].to_numpy(np.float64), pairs[f"{column}_base"].to_numpy(np.float64)
-            )
-            line |= _ends(f"{name}_difference", difference)
-        improvement = improvement_interval(
-            pairs["episode_return"].to_numpy(np.float64)[:, None],
-            pairs["episode_return_base"].to_numpy(np.float64)[:, None],
-            generator,
-            tie=tie(float(chosen["optimal_return"].iloc[0])),
-        )
-        lines.append(line | _ends("improvement", improvement) | {"too_few_seeds": improvement.is_small})
-    differing = [f"{name}_difference" for name in ("return", *costs)]
-    ends = [f"{name}{end}" for name in (*differing, "improvement") for end in ("", "_low", "_high")]
-    columns = [*GROUP, "measure", "pairs", "feasible_pairs", *ends, "too_few_seeds"]
-    return pd.DataFrame(lines, columns=columns)
+    for line, chosen, others in _beside(rows, "method", baseline):
+        ours = chosen[chosen["seed"].isin(others["seed"])]
+        theirs = others[others["seed"].isin(chosen["seed"])]
+        if len(ours):
+            both = ours["feasible"].to_numpy(bool) & theirs["feasible"].to_numpy(bool)
+            line |= {"pairs": len(both), "feasible_pairs": int(both.sum())}
+            lines.append(line | _differences(ours, theirs, generator, paired=True))
+    return _compared(lines, rows, ["pairs", "feasible_pairs"])
+
+
+def group_comparisons(
+    rows: pd.DataFrame, generator: np.random.Generator, *, of: Literal["method", "agent"], baseline: str
+) -> pd.DataFrame:
+    """Compare methods, or agents, with one of them, as independent groups of seeds.
+
+    Two agents with equal seeds share little else, and so do two trials that ran on different machines. All
+    seeds count, feasible or not, also those that only one side has.
+
+    Args:
+        rows: of ``outcomes``.
+        generator: draws the resamples.
+        of: what is compared: methods with the same agent, or agents under the same method.
+        baseline: name (label) of the method, or agent, that the others are compared with.
+
+    Returns:
+        One row per other GROUP and measure, with the columns of ``comparisons``, but intervals and p values
+        of Welch's t test. In place of the pairs are seeds and feasible_seeds, and those of the baseline:
+        baseline_seeds and baseline_feasible_seeds.
+
+    Raises:
+        ValueError: no row has the given baseline.
+    """
+    _check_label(rows, of, baseline)
+    lines = []
+    for line, ours, theirs in _beside(rows, of, baseline):
+        line |= {"seeds": len(ours), "feasible_seeds": int(ours["feasible"].sum())}
+        line |= {"baseline_seeds": len(theirs), "baseline_feasible_seeds": int(theirs["feasible"].sum())}
+        lines.append(line | _differences(ours, theirs, generator, paired=False))
+    counts = ["seeds", "feasible_seeds"]
+    return _compared(lines, rows, [*counts, *(f"baseline_{name}" for name in counts)])
+
+
+def _check_label(rows: pd.DataFrame, of: str, baseline: str) -> None:
+    if not (rows[of] == baseline).any():
+        known = ", ".join(map(str, dict.fromkeys(rows[of])))
+        raise ValueError(f"baseline: no complete trial has the {of} {baseline!r} (found: {known})")
+
+
+def _beside(
+    rows: pd.DataFrame, of: str, baseline: str
+) -> Iterator[tuple[dict[str, Any], pd.DataFrame, pd.DataFrame]]:
+    """Yield labels, outcomes and those of the baseline, for each other GROUP and measure that has both."""
+    same = [name for name in (*GROUP, "measure") if name != of]
+    bases = dict(iter(rows[rows[of] == baseline].groupby(same, observed=True)))
+    for group, chosen in rows.groupby([*GROUP, "measure"], observed=True, sort=False):
+        line: dict[str, Any] = dict(zip((*GROUP, "measure"), group, strict=True))
+        others = bases.get(tuple(line[name] for name in same))
+        if line[of] != baseline and others is not None:
+            yield line, chosen, others
+
+
+def _differences(
+    ours: pd.DataFrame, theirs: pd.DataFrame, generator: np.random.Generator, *, paired: bool
+) -> dict[str, Any]:
+    """Return the differences in return and costs between two groups of outcomes.
+
+    Args:
+        ours: a row a seed.
+        theirs: of the baseline; if paired, with the same seeds in the same order.
+        generator: draws the resamples.
+        paired: whether rows of equal seeds are compared, or independent groups.
+    """
+    compare = paired_difference if paired else group_difference
+    tie_of_returns = tie(float(ours["optimal_return"].iloc[0]))
+    line: dict[str, Any] = {}
+    for name in ("episode_return", *filter(is_cost, map(str, ours))):
+        values, base = ours[name].to_numpy(np.float64), theirs[name].to_numpy(np.float64)
+        difference = compare(values, base)
+        apart = np.abs(values - base if paired else values[:, None] - base)
+        all_tie = bool((apart <= (tie_of_returns if name == "episode_return" else tie(math.nan))).all())
+        column = f"{name.removeprefix('episode_')}_difference"
+        p_value = 1.0 if all_tie and difference.runs > 1 else difference.p_value
+        line |= _ends(column, difference) | {f"{column}_p": p_value}
+    returns, base = (it["episode_return"].to_numpy(np.float64)[:, None] for it in (ours, theirs))
+    improvement = improvement_interval(returns, base, generator, tie=tie_of_returns)
+    return line | _ends("improvement", improvement) | {"too_few_seeds": improvement.is_small}
+
+
+def _compared(lines: Sequence[dict[str, Any]], rows: pd.DataFrame, counts: Sequence[str]) -> pd.DataFrame:
+    """Return a table of differences, with corrected p values; its columns exist even without a line.
+
+    Args:
+        lines: a mapping a row, without the corrected p values.
+        rows: the outcomes that were compared.
+        counts: names of the columns after the measure.
+    """
+    differing = [f"{name}_difference" for name in ("return", *filter(is_cost, map(str, rows)))]
+    ends = [f"{name}{end}" for name in differing for end in ("", "_low", "_high", "_p", "_p_corrected")]
+    improved = ["improvement", "improvement_low", "improvement_high", "too_few_seeds"]
+    table = pd.DataFrame(lines, columns=[*GROUP, "measure", *counts, *ends, *improved])
+    of_measures = table.groupby("measure", sort=False)
+    for name in differing:
+        corrected = of_measures[f"{name}_p"].transform(lambda them: holm(them.to_numpy(np.float64)))
+        table[f"{name}_p_corrected"] = corrected
+    return table
 
 
 def _ends(name: str, interval: Interval) -> dict[str, float]:

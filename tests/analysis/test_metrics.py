@@ -7,12 +7,14 @@ from collections.abc import Callable
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.labels import KEY
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report import table_formats
 from recrl.analysis.statistics import metrics, verdicts
+from recrl.analysis.statistics.intervals import holm
 from recrl.orchestrator.files.sweep_store import SweepStore
 
 
@@ -241,6 +243,68 @@ def test_two_curricula_are_compared_with_each_other(finished: Sweep) -> None:
         ValueError, match=r"^baseline: no complete trial has the method 'linaer' \(found: none, "
     ):
         metrics.comparisons(rows, np.random.default_rng(0), baseline="linaer")
+
+
+def test_agents_are_compared_as_independent_groups(finished: Sweep) -> None:
+    rows = metrics.outcomes(finished)
+    rows["episode_return"] += np.random.default_rng(3).normal(size=len(rows))
+    only_ours = (rows["agent"] == "ppo-lag") & (rows["seed"] == 0)  # the groups may have other seeds
+    compared = metrics.group_comparisons(
+        rows[~only_ours], np.random.default_rng(0), of="agent", baseline="cpo"
+    )
+    assert set(compared["agent"]) == {"ppo-lag"}
+    assert set(compared["method"]) == {"none", "linear", "dynamic"}
+    chosen = {"task": "river-a", "method": "linear", "measure": "stochastic"}
+    row = only(compared, agent="ppo-lag", **chosen)
+    assert row[["seeds", "baseline_seeds"]].tolist() == [2, 3]
+    ours, theirs = (
+        rows[~only_ours & (rows[["agent", *chosen]] == [agent, *chosen.values()]).all(axis=1)]
+        for agent in ("ppo-lag", "cpo")
+    )
+    assert row["baseline_feasible_seeds"] == theirs["feasible"].sum()
+    for name, column in (("return", "episode_return"), ("cost_0", "cost_0")):
+        assert row[f"{name}_difference"] == pytest.approx(ours[column].mean() - theirs[column].mean())
+    test = stats.ttest_ind(ours["episode_return"], theirs["episode_return"], equal_var=False)
+    assert row["return_difference_p"] == pytest.approx(test.pvalue)
+    of_measure = compared[compared["measure"] == "stochastic"]
+    expected = holm(of_measure["return_difference_p"].to_numpy())
+    assert of_measure["return_difference_p_corrected"].to_numpy() == pytest.approx(expected)
+    with pytest.raises(ValueError, match=r"^baseline: no complete trial has the agent 'none' \(found: ppo-"):
+        metrics.group_comparisons(rows, np.random.default_rng(0), of="agent", baseline="none")
+
+
+def test_groups_of_curricula_differ_in_their_intervals_only(finished: Sweep) -> None:
+    rows = metrics.outcomes(finished)
+    pairs = metrics.comparisons(rows, np.random.default_rng(0))
+    groups = metrics.group_comparisons(rows, np.random.default_rng(0), of="method", baseline="none")
+    assert groups["return_difference"].to_numpy() == pytest.approx(pairs["return_difference"].to_numpy())
+    assert groups["improvement_low"].to_list() == pairs["improvement_low"].to_list()
+    assert not groups["return_difference_low"].equals(pairs["return_difference_low"])
+
+
+def test_p_values_are_corrected_for_the_rows_of_a_measure(finished: Sweep) -> None:
+    rows = metrics.outcomes(finished)
+    rows["episode_return"] += np.random.default_rng(3).normal(size=len(rows))
+    compared = metrics.comparisons(rows.assign(optimal_return=math.nan), np.random.default_rng(0))
+    for measure, of_measure in compared.groupby("measure"):
+        p_values = of_measure["return_difference_p"].to_numpy()
+        assert len(p_values) > 2, measure
+        assert of_measure["return_difference_p_corrected"].to_numpy() == pytest.approx(holm(p_values))
+    key = {"task": "river-a", "agent": "cpo", "method": "linear", "measure": "stochastic"}
+    pairs = rows[(rows["task"] == "river-a") & (rows["agent"] == "cpo") & (rows["measure"] == "stochastic")]
+    wide = pairs.pivot(index="seed", columns="method", values="episode_return")
+    expected = stats.ttest_rel(wide["linear"], wide["none"]).pvalue
+    assert only(compared, **key)["return_difference_p"] == pytest.approx(expected)
+
+
+def test_one_seed_has_no_p_value_and_ties_have_one_of_1(finished: Sweep) -> None:
+    rows = metrics.outcomes(finished)
+    one = metrics.comparisons(rows[rows["seed"] == 1], np.random.default_rng(0))
+    assert one[["return_difference_p", "cost_0_difference_p_corrected"]].isna().all(axis=None)
+    equal = rows.assign(episode_return=9.5)
+    equal.loc[equal["method"] == "linear", "episode_return"] += 1e-6
+    tied = metrics.comparisons(equal, np.random.default_rng(0))
+    assert set(tied["return_difference_p"]) == {1.0}
 
 
 def test_interquartile_means_carry_their_warning(finished: Sweep) -> None:

@@ -50,6 +50,16 @@ def test_intervals_from_too_few_seeds_are_marked(finished: Sweep) -> None:
     assert table["return gained"].iloc[0].startswith("15.33 [-17.65, 48.32]")
 
 
+def test_p_values_of_gains_are_shown_where_there_are_two_seeds(finished: Sweep) -> None:
+    rows = metrics.outcomes(finished)
+    compared = metrics.comparisons(rows, np.random.default_rng(0))
+    chosen = table_formats.compared_rows(compared, metrics.summary(rows, finished.trials), Measure.STOCHASTIC)
+    chosen.loc[0, "return_difference_p_corrected"] = 0.0123
+    chosen.loc[1, ["return_difference_p", "return_difference_p_corrected"]] = math.nan  # of one seed
+    chosen.loc[2, "feasible_pairs"] = 0
+    assert table_formats.comparison_table(chosen)["p, corrected"].tolist()[:3] == ["0.012", "", "–"]
+
+
 def test_more_return_of_an_infeasible_policy_is_no_gain_and_one_seed_has_no_mark(finished: Sweep) -> None:
     rows = metrics.outcomes(finished)
     rows = rows[rows["seed"] == 0]

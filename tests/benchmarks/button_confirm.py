@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from tests.benchmarks.differences import paired, two_groups
+from recrl.analysis.statistics.intervals import group_difference, paired_difference
 from tests.benchmarks.velocity_table import Cell
 
 TASK, AGENT, LIMIT = "CarButton2", "ppo-lag", 25.0
@@ -54,10 +54,9 @@ def intervals(seeds: pd.DataFrame) -> Iterator[str]:
     """Yield the differences of linear from none, paired and as two groups."""
     for column in ("return", "cost"):
         linear, none = seeds[column, "linear"].to_numpy(), seeds[column, "none"].to_numpy()
-        mean, low, high, _ = paired(linear - none)
-        _, welch_low, welch_high, _ = two_groups(linear, none)
-        groups = f"Welch {welch_low:.2f} to {welch_high:.2f}"
-        yield f"  {column}: {mean:.2f} (paired {low:.2f} to {high:.2f}; {groups})"
+        pairs, groups = paired_difference(linear, none), group_difference(linear, none)
+        both = f"paired {pairs.low:.2f} to {pairs.high:.2f}; Welch {groups.low:.2f} to {groups.high:.2f}"
+        yield f"  {column}: {pairs.estimate:.2f} ({both})"
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from tests.benchmarks.differences import paired
+from recrl.analysis.statistics.intervals import paired_difference
 from tests.benchmarks.velocity_table import Cell, number
 
 BASELINE = "none"
@@ -42,8 +42,8 @@ def lines(rows: pd.DataFrame, curricula: Sequence[str], limit: float) -> Iterato
         cells = [Cell.of(short, str(agent), group[group["method"] == each]) for each in curricula]
         texts = [f"{number(cell.episode_return)} / {cell.costs}" for cell in cells]
         for each in others:
-            mean, low, high, _ = paired((wide[each] - wide[BASELINE]).to_numpy())
-            texts.append(f"{number(mean)} ({number(low)} to {number(high)})")
+            it = paired_difference(wide[each].to_numpy(), wide[BASELINE].to_numpy())
+            texts.append(f"{number(it.estimate)} ({number(it.low)} to {number(it.high)})")
         yield f"| {short} | `{agent}` | " + " | ".join(texts) + " |"
     counted = pd.concat(complete)
     over = counted["cost"] - limit > counted["cost_se"]

@@ -23,9 +23,8 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+from recrl.analysis.statistics.intervals import CONFIDENCE, group_difference, holm, paired_difference
 from recrl.environments.cmdp import Floats
-
-CONFIDENCE = 0.95
 
 
 def read(paths: Sequence[Path], policy: str, limit: float) -> pd.DataFrame:
@@ -44,19 +43,6 @@ def difference(values: Floats, control: Floats) -> tuple[float, float, float, fl
     return float(values.mean() - control.mean()), float(low), float(high), float(test.pvalue)
 
 
-def holm(p_values: Floats) -> Floats:
-    """P values corrected for their number (Holm 1979).
-
-    >>> holm(np.array([0.03, 0.01, 0.04])).round(2).tolist()
-    [0.06, 0.03, 0.06]
-    """
-    order = np.argsort(p_values)
-    factors = np.arange(len(p_values), 0, -1)
-    corrected = np.empty_like(p_values)
-    corrected[order] = np.minimum(np.maximum.accumulate(p_values[order] * factors), 1.0)
-    return corrected
-
-
 def differences(rows: pd.DataFrame, control: pd.DataFrame, column: str) -> pd.DataFrame:
     """A row a task and agent, with the numbers of seeds on both sides."""
     found = []
@@ -67,35 +53,19 @@ def differences(rows: pd.DataFrame, control: pd.DataFrame, column: str) -> pd.Da
     return table.assign(p_holm=holm(table["p"].to_numpy()))
 
 
-def paired(differences: Floats) -> tuple[float, float, float, float]:
-    """The mean of paired differences, the ends of its interval, and the p value; p is 1 if all are 0."""
-    if not differences.any():
-        return 0.0, 0.0, 0.0, 1.0
-    test = stats.ttest_1samp(differences, 0.0)
-    low, high = test.confidence_interval(CONFIDENCE)
-    return float(differences.mean()), float(low), float(high), float(test.pvalue)
-
-
-def two_groups(values: Floats, control: Floats) -> tuple[float, float, float, float]:
-    """The difference of two means by Welch's test, the ends of its interval, and the p value."""
-    test = stats.ttest_ind(values, control, equal_var=False)
-    low, high = test.confidence_interval(CONFIDENCE)
-    return float(values.mean() - control.mean()), float(low), float(high), float(test.pvalue)
-
-
 def paired_differences(
     rows: pd.DataFrame, baseline: str, column: str, *, as_groups: bool = False
 ) -> pd.DataFrame:
     """A row a task, agent and curriculum: it minus the baseline, over the two or more seeds with both."""
     wide = rows.pivot(index=["task", "agent", "seed"], columns="method", values=column)
+    compare = group_difference if as_groups else paired_difference
     found = []
     for method in wide.columns.drop(baseline):
         pairs = wide[[method, baseline]].dropna()
         for (task, agent), pair in pairs.groupby(level=["task", "agent"]):
-            ours, theirs = pair[method].to_numpy(), pair[baseline].to_numpy()
             if len(pair) > 1:
-                test = two_groups(ours, theirs) if as_groups else paired(ours - theirs)
-                found.append((task, agent, method, len(pair), *test))
+                it = compare(pair[method].to_numpy(), pair[baseline].to_numpy())
+                found.append((task, agent, method, len(pair), it.estimate, it.low, it.high, it.p_value))
     table = pd.DataFrame(found, columns=["task", "agent", "method", "n", column, "low", "high", "p"])
     table = table.sort_values(["task", "agent", "method"])
     return table.assign(p_holm=holm(table["p"].to_numpy()))

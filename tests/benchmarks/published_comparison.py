@@ -28,7 +28,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from tests.benchmarks.differences import holm
+from recrl.analysis.statistics.intervals import holm
 from tests.benchmarks.velocity_table import LIMIT, Cell
 
 PUBLISHED = Path("results/safety-gym/published.csv")
