@@ -36,8 +36,8 @@ TIES = (
 )
 SAMPLED = "That standard error is over the episodes of a trial; the one after ± is over seeds."
 CORRECTED_NOTE = (
-    f"{table_formats.CORRECTED}: of a paired t test of the return, corrected for all rows of this table by "
-    "Holm's method."
+    f"{table_formats.CORRECTED}: of a paired t test, corrected by Holm's method for all rows of two or more "
+    "seeds, also those with a dash. It is 1 if all pairs tie."
 )
 FEW = f"{table_formats.TOO_FEW}: with fewer than {ENOUGH_RUNS} seeds this interval is too short."
 SUMS_NOTE = (

@@ -21,7 +21,7 @@ from recrl.orchestrator.files.atomic_files import write_atomically
 from recrl.orchestrator.redaction import printable
 
 TOO_FEW = "†"
-CORRECTED = "p, corrected"
+CORRECTED = "p of return, corrected"
 INTERVAL = re.compile(r"[\[(][^\[\]()]*\d(?:, | to |–)[^\[\]()]*\d%?[\])]")
 LATEX = {
     "\\": r"\textbackslash{}",
@@ -111,14 +111,15 @@ def comparison_table(rows: pd.DataFrame, suffixes: Sequence[str] = ()) -> pd.Dat
     More return is no gain if a policy of a pair is infeasible, with the curriculum or with none. Such a row
     has no gain, only its added cost and the number of feasible pairs.
 
-    Without two seeds of any row the table has no p values.
+    Without a p value of such a gain the table has no column of them.
 
     Args:
         rows: of ``compared_rows``.
         suffixes: as for ``outcome_table``.
     """
     costs = [name for name in map(str, rows) if name.startswith("cost_") and name.endswith("_difference")]
-    any_tested = bool(rows["return_difference_p"].notna().any())
+    feasible = rows["feasible_pairs"] == rows["pairs"]
+    any_tested = bool((feasible & rows["return_difference_p"].notna()).any())
     lines = []
     for _, row in rows.iterrows():
         line = names_of(row) | {"n": str(row["pairs"])}
@@ -150,14 +151,17 @@ def with_interval(row: pd.Series, name: str) -> str:
 
 
 def p_value(value: float) -> str:
-    """Format a p value; empty if there is none.
+    """Format a p value, so that it can be compared with 0.05; empty if there is none.
 
-    >>> p_value(0.0123), p_value(0.4), p_value(3e-7), p_value(math.nan)
-    ('0.012', '0.40', '< 0.001', '')
+    >>> p_value(0.0123), p_value(0.4), p_value(0.0496), p_value(3e-7), p_value(math.nan)
+    ('0.012', '0.40', '0.0496', '< 0.001', '')
     """
     if math.isnan(value):
         return ""
-    return "< 0.001" if value < 0.001 else f"{value:.{2 if value >= 0.1 else 3}f}"
+    if value < 0.001:
+        return "< 0.001"
+    text = f"{value:.3f}" if value < 0.0995 else f"{value:.2f}"
+    return f"{value:.4f}" if text == "0.050" else text
 
 
 def not_corrected(table: pd.DataFrame) -> str:

@@ -43,6 +43,7 @@ ENOUGH_RUNS = 10
 ENOUGH_FOR_SHARES = 5  # runs: with fewer, Wilson's interval is very wide
 REPLICATIONS = 2000
 CONFIDENCE = 0.95
+ROUNDING = 1e-12  # of the largest value: differences below it are none
 
 Statistic = Callable[[Floats], Floats]
 
@@ -71,7 +72,8 @@ class Difference(Interval):
     """A difference of means, the interval around it, and a test.
 
     Attributes:
-        p_value: of the two-sided t test that the true difference is 0; NaN where there is no interval.
+        p_value: of the two-sided t test that the true difference is 0. NaN where there is no interval, and
+            without any spread: then it is 1 for equal means, and otherwise the test says nothing.
     """
 
     p_value: float
@@ -206,13 +208,14 @@ def paired_difference(values: Floats, baseline: Floats) -> Difference:
         baseline: [n], in the same order.
     """
     mean, error = mean_and_standard_error(np.subtract(values, baseline))
-    return _t_test(mean, error, len(values) - 1.0, len(values))
+    return _t_test(mean, error, len(values) - 1.0, runs=len(values), rounding=_rounding(values, baseline))
 
 
 def group_difference(values: Floats, baseline: Floats) -> Difference:
     """Return the difference between the means of two independent groups, with Welch's 95% interval and test.
 
-    The groups may differ in size and in variance. Equal to ``scipy.stats.ttest_ind(equal_var=False)``.
+    The groups may differ in size and in variance. Equal to ``scipy.stats.ttest_ind(equal_var=False)``, where
+    a group varies.
 
     Args:
         values: [n].
@@ -223,7 +226,8 @@ def group_difference(values: Floats, baseline: Floats) -> Difference:
     freedom = np.array([len(values), len(baseline)]) - 1
     squares = float(np.sum(parts**2 / np.maximum(freedom, 1)))
     degrees = float(np.sum(parts)) ** 2 / squares if squares else float(np.sum(freedom))
-    return _t_test(mean - base, math.sqrt(np.sum(parts)), degrees, min(len(values), len(baseline)))
+    runs, rounding = min(len(values), len(baseline)), _rounding(values, baseline)
+    return _t_test(mean - base, math.sqrt(np.sum(parts)), degrees, runs=runs, rounding=rounding)
 
 
 def holm(p_values: Floats) -> Floats:
@@ -233,8 +237,8 @@ def holm(p_values: Floats) -> Floats:
         p_values: [n], each in [0, 1] or NaN.
 
     Returns:
-        [n]. If each difference with a corrected p below 0.05 is called real, the probability that any of them
-        is not is at most 5%.
+        [n]. If differences with a corrected p below 0.05 are called real, at most 5% of such tables have a
+        false call, provided that each p value holds by itself.
 
     >>> holm(np.array([0.03, 0.01, math.nan, 0.04])).round(2).tolist()
     [0.06, 0.03, nan, 0.06]
@@ -285,13 +289,18 @@ def share_text(successes: int, runs: int, low: float, high: float) -> str:
     return f"{successes} of {runs}{interval if runs >= ENOUGH_FOR_SHARES else ''}"
 
 
-def _t_test(difference: float, error: float, degrees: float, runs: int) -> Difference:
+def _rounding(values: Floats, baseline: Floats) -> float:
+    """Return how far apart two means may be by rounding."""
+    return ROUNDING * float(np.max(np.abs([*values, *baseline]), initial=0.0))
+
+
+def _t_test(difference: float, error: float, degrees: float, *, runs: int, rounding: float) -> Difference:
     """Return Student's t 95% interval and two-sided test of a difference with a standard error."""
     if runs < 2:
         return Difference(difference, math.nan, math.nan, runs, True, math.nan)
     reach = float(stdtrit(degrees, 0.5 + CONFIDENCE / 2.0)) * error
-    if error == 0.0:
-        p_value = float(difference == 0.0)
+    if error <= rounding:
+        p_value = 1.0 if abs(difference) <= rounding else math.nan
     else:
         p_value = 2.0 * float(stdtr(degrees, -abs(difference) / error))
     return Difference(difference, difference - reach, difference + reach, runs, False, p_value)

@@ -211,25 +211,30 @@ def comparisons(
         generator: draws the resamples.
         baseline: name (label) of the method that the others are compared with.
 
+    The p values are corrected for the rows that are given: choose tasks, agents and methods before the call.
+
     Returns:
-        GROUP, measure, pairs (seeds that both have), feasible_pairs (those whose trials are both feasible);
-        return_difference, the mean paired difference to the baseline, with Student's 95% interval (_low,
-        _high) and p value (_p; 1 if all pairs tie, ``verdicts.tie``, and NaN for one pair);
-        return_difference_p_corrected, the p value corrected by ``holm`` for all rows of the measure;
-        the same for cost_i_difference; improvement, the probability that a run returns more than a run of
-        the baseline (of these seeds; ties count half), with its bootstrap interval (_low, _high);
-        too_few_seeds (the bootstrap interval is then too short).
+        GROUP, measure, baseline, pairs (seeds that both have), feasible_pairs (those whose trials are both
+        feasible); return_difference, the mean paired difference to the baseline, with Student's 95% interval
+        (_low, _high) and p value (_p; 1 if all pairs tie, NaN for one pair or without any spread);
+        return_difference_p_corrected, the p value corrected by ``holm`` for all rows of the measure; the same
+        for each cost_i_difference, corrected by itself; improvement, the probability that a run returns more
+        than a run of the baseline (of these seeds; ties count half), with its bootstrap interval (_low,
+        _high); too_few_seeds (the bootstrap interval is then too short). Ties are those of ``verdicts.tie``,
+        of costs only those by rounding.
 
     Raises:
-        ValueError: no row has the given baseline. Without ``none`` the table is empty by default.
+        ValueError: no row has the given baseline, or a trial is in the rows twice. Without ``none`` the table
+            is empty by default.
     """
+    _check_unique(rows)
     if baseline != BASELINE:
         _check_label(rows, "method", baseline)
     lines = []
-    for line, chosen, others in _beside(rows, "method", baseline):
-        ours = chosen[chosen["seed"].isin(others["seed"])]
-        theirs = others[others["seed"].isin(chosen["seed"])]
-        if len(ours):
+    for line, *sides in _beside(rows, "method", baseline):
+        seeds = sides[0][["seed"]].merge(sides[1][["seed"]])
+        ours, theirs = (seeds.merge(side) for side in sides)
+        if len(seeds):
             both = ours["feasible"].to_numpy(bool) & theirs["feasible"].to_numpy(bool)
             line |= {"pairs": len(both), "feasible_pairs": int(both.sum())}
             lines.append(line | _differences(ours, theirs, generator, paired=True))
@@ -241,8 +246,9 @@ def group_comparisons(
 ) -> pd.DataFrame:
     """Compare methods, or agents, with one of them, as independent groups of seeds.
 
-    Two agents with equal seeds share little else, and so do two trials that ran on different machines. All
-    seeds count, feasible or not, also those that only one side has.
+    For runs that share little but the number of a seed, such as two agents. All seeds with a complete trial
+    count, feasible or not, also those that only one side has. More return is a gain only where all seeds of
+    both sides are feasible.
 
     Args:
         rows: of ``outcomes``.
@@ -252,12 +258,16 @@ def group_comparisons(
 
     Returns:
         One row per other GROUP and measure, with the columns of ``comparisons``, but intervals and p values
-        of Welch's t test. In place of the pairs are seeds and feasible_seeds, and those of the baseline:
+        of Welch's t test. A p value is 1 if every run ties every run of the baseline, and NaN if a side has
+        one seed. In place of the pairs are seeds and feasible_seeds, and those of the baseline:
         baseline_seeds and baseline_feasible_seeds.
 
     Raises:
-        ValueError: no row has the given baseline.
+        ValueError: ``of`` is something else, no row has the given baseline, or a trial is in the rows twice.
     """
+    if of not in ("method", "agent"):
+        raise ValueError(f"of: must be 'method' or 'agent', got {of!r}")
+    _check_unique(rows)
     _check_label(rows, of, baseline)
     lines = []
     for line, ours, theirs in _beside(rows, of, baseline):
@@ -266,6 +276,13 @@ def group_comparisons(
         lines.append(line | _differences(ours, theirs, generator, paired=False))
     counts = ["seeds", "feasible_seeds"]
     return _compared(lines, rows, [*counts, *(f"baseline_{name}" for name in counts)])
+
+
+def _check_unique(rows: pd.DataFrame) -> None:
+    twice = rows[rows.duplicated([*KEY, "measure"])]
+    if len(twice):
+        names = ", ".join(str(twice.iloc[0][name]) for name in (*KEY, "measure"))
+        raise ValueError(f"rows: a trial is there twice: {names}")
 
 
 def _check_label(rows: pd.DataFrame, of: str, baseline: str) -> None:
@@ -284,7 +301,7 @@ def _beside(
         line: dict[str, Any] = dict(zip((*GROUP, "measure"), group, strict=True))
         others = bases.get(tuple(line[name] for name in same))
         if line[of] != baseline and others is not None:
-            yield line, chosen, others
+            yield line | {"baseline": baseline}, chosen, others
 
 
 def _differences(
@@ -325,7 +342,7 @@ def _compared(lines: Sequence[dict[str, Any]], rows: pd.DataFrame, counts: Seque
     differing = [f"{name}_difference" for name in ("return", *filter(is_cost, map(str, rows)))]
     ends = [f"{name}{end}" for name in differing for end in ("", "_low", "_high", "_p", "_p_corrected")]
     improved = ["improvement", "improvement_low", "improvement_high", "too_few_seeds"]
-    table = pd.DataFrame(lines, columns=[*GROUP, "measure", *counts, *ends, *improved])
+    table = pd.DataFrame(lines, columns=[*GROUP, "measure", "baseline", *counts, *ends, *improved])
     of_measures = table.groupby("measure", sort=False)
     for name in differing:
         corrected = of_measures[f"{name}_p"].transform(lambda them: holm(them.to_numpy(np.float64)))

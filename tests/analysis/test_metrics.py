@@ -290,11 +290,76 @@ def test_p_values_are_corrected_for_the_rows_of_a_measure(finished: Sweep) -> No
         p_values = of_measure["return_difference_p"].to_numpy()
         assert len(p_values) > 2, measure
         assert of_measure["return_difference_p_corrected"].to_numpy() == pytest.approx(holm(p_values))
+        costs = of_measure["cost_0_difference_p"].to_numpy()  # by themselves
+        assert of_measure["cost_0_difference_p_corrected"].to_numpy() == pytest.approx(
+            holm(costs), nan_ok=True
+        )
     key = {"task": "river-a", "agent": "cpo", "method": "linear", "measure": "stochastic"}
     pairs = rows[(rows["task"] == "river-a") & (rows["agent"] == "cpo") & (rows["measure"] == "stochastic")]
     wide = pairs.pivot(index="seed", columns="method", values="episode_return")
     expected = stats.ttest_rel(wide["linear"], wide["none"]).pvalue
     assert only(compared, **key)["return_difference_p"] == pytest.approx(expected)
+
+
+def test_infeasible_rows_count_in_the_correction_and_rows_of_one_seed_do_not(finished: Sweep) -> None:
+    rows = metrics.outcomes(finished).assign(optimal_return=math.nan)
+    rows = rows[(rows["measure"] == "stochastic") & (rows["task"] == "river-a") & (rows["agent"] == "cpo")]
+    rows["episode_return"] += np.random.default_rng(3).normal(size=len(rows))
+    both = metrics.comparisons(rows, np.random.default_rng(0))
+    assert both["method"].tolist() == ["linear", "dynamic"]
+    smaller, larger = sorted(both["return_difference_p"])
+    assert sorted(both["return_difference_p_corrected"]) == pytest.approx(
+        [min(2 * smaller, 1.0), max(min(2 * smaller, 1.0), larger)]
+    )
+    infeasible = rows.assign(feasible=rows["feasible"] & (rows["method"] != "linear"))
+    same = metrics.comparisons(infeasible, np.random.default_rng(0))
+    assert same["return_difference_p_corrected"].equals(both["return_difference_p_corrected"])
+    one = rows[(rows["method"] != "dynamic") | (rows["seed"] == 0)]
+    row = only(metrics.comparisons(one, np.random.default_rng(0)), method="linear")
+    assert row["return_difference_p_corrected"] == row["return_difference_p"]
+
+
+def test_pairs_do_not_depend_on_the_order_of_rows(finished: Sweep) -> None:
+    rows = metrics.outcomes(finished)
+    ordered = metrics.comparisons(rows, np.random.default_rng(0))
+    mixed = metrics.comparisons(rows.sample(frac=1.0, random_state=1), np.random.default_rng(0))
+    key = ["task", "agent", "method", "measure"]
+    columns = [name for name in map(str, ordered) if name.startswith(("pairs", "feasible", "return", "cost"))]
+    pd.testing.assert_frame_equal(
+        mixed.set_index(key)[columns].sort_index(), ordered.set_index(key)[columns].sort_index()
+    )
+
+
+def test_wrong_rows_are_not_compared(finished: Sweep) -> None:
+    rows = metrics.outcomes(finished)
+    twice, numbers = pd.concat([rows, rows.iloc[:1]]), np.random.default_rng(0)
+    said = r"^rows: a trial is there twice: river-a, ppo-lag, none, 0, deployment$"
+    with pytest.raises(ValueError, match=said):
+        metrics.comparisons(twice, numbers)
+    with pytest.raises(ValueError, match=said):
+        metrics.group_comparisons(twice, numbers, of="agent", baseline="cpo")
+    with pytest.raises(ValueError, match=r"^of: must be 'method' or 'agent', got 'curriculum'$"):
+        metrics.group_comparisons(rows, numbers, of="curriculum", baseline="none")  # type: ignore[arg-type]
+
+
+def test_groups_of_one_seed_have_no_p_value_and_ties_are_of_all_runs(finished: Sweep) -> None:
+    rows = metrics.outcomes(finished)
+    of_measure = rows[(rows["measure"] == "stochastic") & (rows["task"] == "river-a")]
+    one = of_measure[(of_measure["agent"] == "ppo-lag") | (of_measure["seed"] == 0)]
+    alone = metrics.group_comparisons(one, np.random.default_rng(0), of="agent", baseline="cpo")
+    assert len(alone)
+    assert alone[["return_difference_low", "return_difference_p"]].isna().all(axis=None)
+    tied = of_measure.assign(episode_return=5.0 + 0.05 * of_measure["seed"])  # at most 0.1 apart
+    groups = metrics.group_comparisons(tied, np.random.default_rng(0), of="agent", baseline="cpo")
+    assert set(groups["return_difference_p"]) == {1.0}
+    spread = of_measure.assign(episode_return=5.0 + 0.2 * of_measure["seed"])  # pairs tie, all runs do not
+    pairs = metrics.comparisons(spread, np.random.default_rng(0))
+    assert set(pairs["return_difference_p"]) == {1.0}
+    moved = spread["episode_return"] + 0.1 * (spread["agent"] == "cpo")
+    groups = metrics.group_comparisons(
+        spread.assign(episode_return=moved), np.random.default_rng(0), of="agent", baseline="cpo"
+    )
+    assert (groups["return_difference_p"] < 1.0).all()
 
 
 def test_one_seed_has_no_p_value_and_ties_have_one_of_1(finished: Sweep) -> None:

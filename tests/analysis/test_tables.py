@@ -50,14 +50,18 @@ def test_intervals_from_too_few_seeds_are_marked(finished: Sweep) -> None:
     assert table["return gained"].iloc[0].startswith("15.33 [-17.65, 48.32]")
 
 
-def test_p_values_of_gains_are_shown_where_there_are_two_seeds(finished: Sweep) -> None:
+def test_p_values_of_gains_are_shown_where_there_are_two_seeds(finished: Sweep, tmp_path: Path) -> None:
     rows = metrics.outcomes(finished)
     compared = metrics.comparisons(rows, np.random.default_rng(0))
     chosen = table_formats.compared_rows(compared, metrics.summary(rows, finished.trials), Measure.STOCHASTIC)
     chosen.loc[0, "return_difference_p_corrected"] = 0.0123
     chosen.loc[1, ["return_difference_p", "return_difference_p_corrected"]] = math.nan  # of one seed
     chosen.loc[2, "feasible_pairs"] = 0
-    assert table_formats.comparison_table(chosen)["p, corrected"].tolist()[:3] == ["0.012", "", "–"]
+    assert table_formats.comparison_table(chosen)["p of return, corrected"].tolist()[:3] == ["0.012", "", "–"]
+    _, tables = table_files.write_tables(finished, tmp_path)
+    beside_none = [it for it in tables.shown if "minus none" in it.heading]
+    assert len(beside_none) == 2
+    assert all("p of return, corrected: of a paired t test" in it.note for it in beside_none)
 
 
 def test_more_return_of_an_infeasible_policy_is_no_gain_and_one_seed_has_no_mark(finished: Sweep) -> None:
@@ -73,6 +77,7 @@ def test_more_return_of_an_infeasible_policy_is_no_gain_and_one_seed_has_no_mark
     assert table["feasible pairs"].tolist()[:2] == ["0 of 1", "1 of 1"]
     assert "–" not in list(table.iloc[1])
     assert not table["P(higher return)"].str.contains("†").any()
+    assert "p of return, corrected" not in table
 
 
 def with_failures(sweep: Sweep) -> Sweep:

@@ -19,6 +19,7 @@ import numpy as np
 
 from recrl.analysis.statistics.intervals import (
     Interval,
+    group_difference,
     improvement_interval,
     interquartile_mean,
     mean_interval,
@@ -60,6 +61,11 @@ def intervals(generator: np.random.Generator) -> dict[str, tuple[Callable[[int],
         made[f"share of {share}, Wilson"] = (
             lambda n, p=share: wilson_interval(int(generator.binomial(n, p)), n),  # type: ignore[misc]
             share,
+        )
+    for ratio in (1.0, 3.0):
+        made[f"two groups, spread {ratio:g} to 1, Welch"] = (
+            lambda n, scale=ratio: group_difference(scale * row(n), row(n)),  # type: ignore[misc]
+            0.0,
         )
     return made
 
