@@ -220,7 +220,8 @@ class Trial:
     def _next_step(self, episodes: tuple[EpisodeStats, ...], observations: Any) -> None:
         """Call the teacher, or enter deployment; add the policy noise of the next step."""
         if self.phase is Phase.DEPLOYMENT:
-            self._warn_of_hard_landing()
+            if not self.learned:
+                self._warn_of_hard_landing()
             self._step = self._step.in_deployment(self.spec.deploy_limits)
             return
         before = self._step

@@ -234,6 +234,8 @@ def test_a_limit_that_falls_at_once_when_training_ends_is_an_event(
     monkeypatch.setitem(TEACHERS, "mine", replace(kind, is_control=True))
     assert run(tmp_path / "control", own).events() == []
     assert run(tmp_path / "soft", replace(SPEC, method=Choice("none"))).events() == []
+    monkeypatch.setitem(TEACHERS, "mine", kind)
+    assert run(tmp_path / "no-deployment", replace(own, train_steps=1200, deploy_steps=0)).events() == []
     # a limit that falls steadily is a little above d_d in the last update
     linear = run(
         tmp_path / "linear", replace(SPEC, method=Choice("linear"), train_limits=CostLimits((50.0,)))
