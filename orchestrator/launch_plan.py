@@ -154,16 +154,21 @@ class Estimate:
     """Estimated resources of a plan.
 
     Attributes:
-        wall_seconds: with ``concurrent`` parallel trials, or None if no trial of some task and agent has run.
+        cpu_seconds: of all trials that are left, or None if no trial of some task and agent has run.
         concurrent: number of parallel trials.
         gigabytes: main memory while they run.
         unknown: the tasks and agents without a measured speed, as ``task agent``.
     """
 
-    wall_seconds: float | None
+    cpu_seconds: float | None
     concurrent: int
     gigabytes: float
     unknown: tuple[str, ...]
+
+    @property
+    def wall_seconds(self) -> float | None:
+        """With ``concurrent`` parallel trials; None if unknown."""
+        return None if self.cpu_seconds is None else self.cpu_seconds / max(1, self.concurrent)
 
 
 def make_plan(specs: Sequence[TrialSpec], store: SweepStore, selection: TrialSelection | None = None) -> Plan:
@@ -224,7 +229,7 @@ def estimate(plan: Plan, *, concurrent: int, speeds: Mapping[str, float] | None 
             unknown[kind] = f"{trial.spec.task.label} {trial.spec.agent.label}"
     running = min(concurrent, len(plan.to_do))
     return Estimate(
-        wall_seconds=None if unknown else cpu_seconds / max(1, running),
+        cpu_seconds=None if unknown else cpu_seconds,
         concurrent=running,
         gigabytes=GIGABYTES_AROUND + running * GIGABYTES_PER_TRIAL if running else 0.0,
         unknown=tuple(unknown.values()),

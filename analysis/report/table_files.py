@@ -39,6 +39,7 @@ CORRECTED_NOTE = (
     f"{table_formats.CORRECTED}: of a paired t test, corrected by Holm's method for all rows of two or more "
     "seeds, also those with a dash. It is 1 if all pairs tie."
 )
+LATEX_NOTE = "n: seeds; +-: one standard error over seeds; in brackets: 95% intervals."
 FEW = f"{table_formats.TOO_FEW}: with fewer than {ENOUGH_RUNS} seeds this interval is too short."
 SUMS_NOTE = (
     "Sums over the policies of the training phase, one expected episode each; means over n seeds. A policy "
@@ -142,8 +143,8 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     judged = count_verdicts(rows, compared, curriculum_flags(sweep), sweep.trials, cost_names(sweep))
     suffixes = [cost_suffix(sweep, i) for i in range(sweep.num_costs)]
     outcomes = _outcome_tables(rows, averaged, suffixes)
-    latex = [f"% {it.heading}.\n{table_formats.latex(it.table)}\n" for it in outcomes]
     shown = [*outcomes, *_comparison_tables(compared, averaged, suffixes)]
+    latex = [f"% {it.heading}. {LATEX_NOTE}\n{table_formats.latex(it.table)}\n" for it in shown]
     if len(counted_claims):
         written.append(table_formats.write_csv(counted_claims, folder / "claims.csv"))
         shown.append(_claims(counted_claims))

@@ -47,7 +47,8 @@ def outcome_table(summary: pd.DataFrame, measure: Measure, suffixes: Sequence[st
     """Format return, costs, regret and fractions of feasible and solved seeds.
 
     The regret, J*(d_d) minus the return, is left out if a seed is infeasible, because its return may be above
-    J*(d_d). Failed trials are in the fractions, as neither feasible nor solved; n counts the others.
+    J*(d_d). Failed trials are in the fractions, as neither feasible nor solved; n counts the others. Where no
+    optimum is known, the table has no optimum, regret and fraction of solved seeds.
 
     Args:
         summary: of ``metrics.summary``.
@@ -57,6 +58,7 @@ def outcome_table(summary: pd.DataFrame, measure: Measure, suffixes: Sequence[st
     rows = summary[summary["measure"] == measure.value]
     costs = [name for name in map(str, rows) if f"{name}_se" in rows and name.startswith("cost_")]
     any_failed = bool((rows["failed"] > 0).any())
+    any_known = bool(rows["optimal_return"].notna().any())
     lines = []
     for _, row in rows.iterrows():
         line = names_of(row) | {"n": str(row["seeds"])}
@@ -67,13 +69,15 @@ def outcome_table(summary: pd.DataFrame, measure: Measure, suffixes: Sequence[st
             line[f"cost{which}"] = with_error(row[name], row[f"{name}_se"], digits=3)  # 5.002 is above 5
             line[f"limit{which}"] = number(row[f"deploy_limit_{name[5:]}"])
         line["return"] = with_error(row["episode_return"], row["episode_return_se"])
-        line["optimum"] = number(row["optimal_return"])
         seeds, feasible = int(row["seeds"]), int(row["feasible_seeds"])
         ended = seeds + int(row["failed"])
-        line["regret"] = with_error(row["gap"], row["gap_se"]) if feasible == seeds else DASH
+        if any_known:
+            line["optimum"] = number(row["optimal_return"])
+            line["regret"] = with_error(row["gap"], row["gap_se"]) if feasible == seeds else DASH
         line["feasible"] = share_text(feasible, ended, row["feasible_low"], row["feasible_high"])
-        found = share_text(int(row["optimal_seeds"]), ended, row["optimal_low"], row["optimal_high"])
-        line["solved"] = DASH if math.isnan(row["optimal_return"]) else found
+        if any_known:
+            found = share_text(int(row["optimal_seeds"]), ended, row["optimal_low"], row["optimal_high"])
+            line["solved"] = DASH if math.isnan(row["optimal_return"]) else found
         lines.append(line)
     return pd.DataFrame(lines)
 

@@ -28,24 +28,26 @@ class Halving:
         self.config = HalvingConfig.model_validate(dict(spec.options))
 
     def start(self):
-        return self._state(0, self.spec.train_limits, [])
+        return self._state(0, self.spec.train_limits, since=0)
 
     def step(self, state, report):
         if already_seen(state, report):  # asked again after a crash: the same answer
             return CurriculumStep.from_json(state), state
-        limits = CostLimits.from_json(state["limits"])
-        costs = [*state["costs"], *(list(episode.costs) for episode in report.episodes)]
+        limits, since = CostLimits.from_json(state["limits"]), state["since"]
         if progress(report.env_steps, self.spec.train_steps) >= 1.0:
-            return self._state(report.update, self.spec.deploy_limits, [])
+            return self._state(report.update, self.spec.deploy_limits, report.env_steps)
+        # an episode that began before the last judgement may have begun under another limit
+        new = [list(episode.costs) for episode in report.episodes if episode.begin_step >= since]
+        costs = [*state["costs"], *new]
         if len(costs) < self.config.episodes:
-            return self._state(report.update, limits, costs)
+            return self._state(report.update, limits, since, costs)
         means = map(fmean, zip(*costs, strict=True))
         lower = map(halved, limits, self.spec.deploy_limits, means)
-        return self._state(report.update, CostLimits(tuple(lower)), [])
+        return self._state(report.update, CostLimits(tuple(lower)), report.env_steps)
 
-    def _state(self, update, limits, costs):
+    def _state(self, update, limits, since, costs=()):
         asked = CurriculumStep(limits)
-        return asked, {"update": update, "costs": costs, **asked.to_json()}
+        return asked, {"update": update, "since": since, "costs": list(costs), **asked.to_json()}
 
 
 HALVING = TeacherKind(

@@ -74,15 +74,16 @@ def plan_sentence(plan: Plan) -> str:
 
 
 def estimate_sentence(estimate: Estimate, where: str) -> str:
-    """Summarise an estimate: ``about 4 min with 2 trials at once on this machine, about 1.9 GB``."""
+    """Summarise an estimate: ``about 4 min with 2 trials at once, about 1.9 GB, 8 min of CPU time``."""
     if not estimate.concurrent:
         return "nothing to do"
     memory = f"about {estimate.gigabytes:.1f} GB of memory"
     at_once = f"{counted(estimate.concurrent, 'trial')} at once {where}"
-    if estimate.wall_seconds is None:
+    if estimate.wall_seconds is None or estimate.cpu_seconds is None:
         names = ", ".join(dict.fromkeys(estimate.unknown))
         return f"time unknown until a first trial has run ({names}); {at_once}, {memory}"
-    return f"about {duration(estimate.wall_seconds)} with {at_once}, {memory}"
+    cpu = f"{duration(estimate.cpu_seconds)} of CPU time"
+    return f"about {duration(estimate.wall_seconds)} with {at_once}, {memory}, {cpu}"
 
 
 def status_table(progress: SweepProgress) -> Table:

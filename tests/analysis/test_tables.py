@@ -33,6 +33,13 @@ def test_a_row_a_group_with_absolute_numbers(finished: Sweep) -> None:
     }
 
 
+def test_where_no_optimum_is_known_there_is_no_regret_and_nothing_solved(finished: Sweep) -> None:
+    summary = metrics.summary(metrics.outcomes(finished), finished.trials)
+    known = list(table_formats.outcome_table(summary, Measure.STOCHASTIC))
+    unknown = list(table_formats.outcome_table(summary.assign(optimal_return=math.nan), Measure.STOCHASTIC))
+    assert [name for name in known if name not in unknown] == ["optimum", "regret", "solved"]
+
+
 def test_shares_have_an_interval_from_five_seeds_on_and_violators_no_regret(finished: Sweep) -> None:
     summary = metrics.summary(metrics.outcomes(finished), finished.trials)
     summary = summary.assign(seeds=5, feasible_seeds=4, optimal_seeds=5)
@@ -61,6 +68,9 @@ def test_p_values_of_gains_are_shown_where_there_are_two_seeds(finished: Sweep, 
     _, tables = table_files.write_tables(finished, tmp_path)
     beside_none = [it for it in tables.shown if "minus none" in it.heading]
     assert len(beside_none) == 2
+    text = (tmp_path / "outcomes.tex").read_text(encoding="utf-8")
+    assert "% Final policy, stochastic, minus none. n: seeds; +-: one standard error over seeds" in text
+    assert "return gained & p of return, corrected & cost added" in text
     assert all("p of return, corrected: of a paired t test" in it.note for it in beside_none)
 
 

@@ -5,11 +5,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from recrl.orchestrator.cli.display import estimate_sentence
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.grid.file_models import Resources
 from recrl.orchestrator.launch_grid import room
 from recrl.orchestrator.launch_plan import (
+    Estimate,
     PlannedAction,
     TrialSelection,
     estimate,
@@ -109,7 +111,16 @@ def test_the_time_follows_from_the_speed_of_the_same_task_and_agent(store: Sweep
     }
     found = estimate(plan, concurrent=2)
     assert found.unknown == ()
+    assert found.cpu_seconds == pytest.approx(3 * seconds["ppo-lag"] + 3 * seconds["cpo"])
     assert found.wall_seconds == pytest.approx((3 * seconds["ppo-lag"] + 3 * seconds["cpo"]) / 2)
+
+
+def test_the_sentence_has_wall_time_and_cpu_time() -> None:
+    found = Estimate(cpu_seconds=7200.0, concurrent=2, gigabytes=1.9, unknown=())
+    said = estimate_sentence(found, "on this machine")
+    assert said == (
+        "about 1 h with 2 trials at once on this machine, about 1.9 GB of memory, 2 h of CPU time"
+    )
 
 
 def test_a_trial_that_has_taken_no_step_tells_no_speed(store: SweepStore) -> None:
