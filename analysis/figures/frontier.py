@@ -68,7 +68,10 @@ def return_against_cost(sweep: Sweep) -> Figure | None:
             known = known or bool(costs.size)
             for axes, agent in zip(line, agents, strict=True):
                 axes.plot(costs, returns, color=OPTIMUM_COLOUR, linewidth=0.9, zorder=1.0)
-                _points(axes, chosen[chosen["agent"] == agent], look, far=far)
+                of_agent = chosen[chosen["agent"] == agent]
+                _points(axes, of_agent, look, far=far)
+                if not len(of_agent):
+                    axes.text(0.5, 0.5, "no complete trial", ha="center", transform=axes.transAxes)
                 for limit in sorted(set(chosen[LIMIT])):
                     axes.axvline(limit, color=LIMIT_COLOUR, linewidth=1.1, linestyle=panels.DASHED)
                     axes.axvspan(limit, far, **panels.ABOVE_LIMIT)

@@ -246,6 +246,15 @@ def test_a_cost_beyond_the_axis_is_on_the_right_edge_and_the_legend_says_so(fini
     assert np.asarray(far.axes[0].collections[0].get_offsets())[0].tolist()[0] == 50.0  # ten times the limit
 
 
+def test_a_panel_without_a_complete_trial_says_so(finished: Sweep) -> None:
+    missing = (finished.trials["task"] == "river-a") & (finished.trials["agent"] == "cpo")
+    failed = finished.trials["status"].where(~missing, "failed")
+    figure = return_against_cost(dataclasses.replace(finished, trials=finished.trials.assign(status=failed)))
+    assert figure is not None
+    texts = [[text.get_text() for text in axes.texts] for axes in figure.axes]
+    assert texts == [[], ["no complete trial"], [], []]
+
+
 def test_a_legend_is_read_row_by_row_in_even_rows(made_up_sweep: Callable[..., SweepStore]) -> None:
     methods = ["none", "linear", "cosine", "exponential", "dynamic"]
     store = made_up_sweep(seeds=1, tasks=["a"], agents=["cpo"], methods=methods)
