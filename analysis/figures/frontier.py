@@ -71,7 +71,10 @@ def return_against_cost(sweep: Sweep) -> Figure | None:
                 of_agent = chosen[chosen["agent"] == agent]
                 _points(axes, of_agent, look, far=far)
                 if not len(of_agent):
-                    axes.text(0.5, 0.5, "no complete trial", ha="center", transform=axes.transAxes)
+                    plain = {"facecolor": "white", "edgecolor": "none"}
+                    axes.text(
+                        0.5, 0.5, "no complete trial", ha="center", transform=axes.transAxes, bbox=plain
+                    )
                 for limit in sorted(set(chosen[LIMIT])):
                     axes.axvline(limit, color=LIMIT_COLOUR, linewidth=1.1, linestyle=panels.DASHED)
                     axes.axvspan(limit, far, **panels.ABOVE_LIMIT)
