@@ -18,6 +18,7 @@ from recrl.analysis.report import table_formats
 from recrl.analysis.report.text_tables import bound_table, claims_table
 from recrl.analysis.report.verdict_texts import tolerance_sentence
 from recrl.analysis.statistics import claims, metrics
+from recrl.analysis.statistics.comparisons import comparisons
 from recrl.analysis.statistics.cumulative_cost import cumulative_costs
 from recrl.analysis.statistics.intervals import ENOUGH_RUNS
 from recrl.analysis.statistics.metrics import Measure
@@ -136,7 +137,7 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
     generator = np.random.default_rng(BOOTSTRAP_SEED)
     averaged = metrics.summary(rows, sweep.trials)
     robust = metrics.robust_summary(rows, generator).drop(columns=["seeds", "too_few_seeds"])
-    compared = metrics.comparisons(rows, generator)
+    compared = comparisons(rows, generator)
     counted_claims = claims.count_claims(rows, totals, sweep.trials)
     whole = pd.merge(averaged, robust, on=[*GROUP, "measure"], how="left", sort=False)
     whole["too_few_seeds"] = whole["seeds"] < ENOUGH_RUNS

@@ -100,7 +100,7 @@ def compared_rows(comparisons: pd.DataFrame, summary: pd.DataFrame, measure: Mea
     """Return the comparisons of one measure, with ``seeds`` and ``feasible_seeds`` of the curriculum.
 
     Args:
-        comparisons: of ``metrics.comparisons``.
+        comparisons: of ``comparisons.comparisons``.
         summary: of ``metrics.summary``.
         measure: which of the three outcomes.
     """

@@ -73,8 +73,8 @@ class Difference(Interval):
     """A difference of means, the interval around it, and a test.
 
     Attributes:
-        p_value: of the two-sided t test that the true difference is 0. NaN where there is no interval, and
-            without any spread: then it is 1 for equal means, and otherwise the test says nothing.
+        p_value: of the two-sided t test that the true difference is 0. NaN with fewer than two runs.
+            Otherwise it is 1 if all runs tie, and NaN if the standard error is 0.
     """
 
     p_value: float
@@ -106,7 +106,7 @@ def mean_interval(values: Floats) -> Interval:
     count = len(values)
     if count < 2:
         return Interval(mean, math.nan, math.nan, count, True)
-    reach = float(stdtrit(count - 1, 0.5 + CONFIDENCE / 2.0)) * error
+    reach = _reach(error, count - 1.0)
     return Interval(mean, mean - reach, mean + reach, count, False)
 
 
@@ -198,21 +198,24 @@ def improvement_interval(
     return _percentile_interval(estimate, replicated, min(len(scores), len(others)), CONFIDENCE)
 
 
-def paired_difference(values: Floats, baseline: Floats) -> Difference:
+def paired_difference(values: Floats, baseline: Floats, *, tie: float = 0.0) -> Difference:
     """Return the mean difference between runs of equal seeds, with Student's t 95% interval and test.
 
-    Equal seeds share the first policy and the stream of the environment, so that differences within a
-    seed vary less than differences between seeds.
+    Equal seeds share the first policy and the stream of the environment. Pairing helps only if this makes
+    the runs of one seed vary together.
 
     Args:
         values: [n], in the order of the seeds.
         baseline: [n], in the same order.
+        tie: values at most this far apart count as equal, at least 0. If all pairs are equal, p is 1.
     """
-    mean, error = mean_and_standard_error(np.subtract(values, baseline))
-    return _t_test(mean, error, len(values) - 1.0, runs=len(values), rounding=_rounding(values, baseline))
+    each = np.subtract(values, baseline)
+    mean, error = mean_and_standard_error(each)
+    rounding = _rounding(values, baseline)
+    return _t_test(mean, error, len(each) - 1.0, runs=len(each), apart=each, tie=tie, rounding=rounding)
 
 
-def group_difference(values: Floats, baseline: Floats) -> Difference:
+def group_difference(values: Floats, baseline: Floats, *, tie: float = 0.0) -> Difference:
     """Return the difference between the means of two independent groups, with Welch's 95% interval and test.
 
     The groups may differ in size and in variance. Equal to ``scipy.stats.ttest_ind(equal_var=False)``, where
@@ -221,14 +224,22 @@ def group_difference(values: Floats, baseline: Floats) -> Difference:
     Args:
         values: [n].
         baseline: [n'].
+        tie: as for ``paired_difference``; p is 1 if every value equals every one of the baseline.
     """
     (mean, error), (base, base_error) = map(mean_and_standard_error, (values, baseline))
-    parts = np.array([error, base_error]) ** 2
+    parts = np.array([error, base_error]) ** 2  # s^2 / n and s'^2 / n'
     freedom = np.array([len(values), len(baseline)]) - 1
     squares = float(np.sum(parts**2 / np.maximum(freedom, 1)))
     degrees = float(np.sum(parts)) ** 2 / squares if squares else float(np.sum(freedom))
-    runs, rounding = min(len(values), len(baseline)), _rounding(values, baseline)
-    return _t_test(mean - base, math.sqrt(np.sum(parts)), degrees, runs=runs, rounding=rounding)
+    return _t_test(
+        mean - base,
+        math.sqrt(np.sum(parts)),
+        degrees,
+        runs=min(len(values), len(baseline)),
+        apart=np.subtract.outer(values, baseline),
+        tie=tie,
+        rounding=_rounding(values, baseline),
+    )
 
 
 def holm(p_values: Floats) -> Floats:
@@ -238,8 +249,7 @@ def holm(p_values: Floats) -> Floats:
         p_values: [n], each in [0, 1] or NaN.
 
     Returns:
-        [n]. If differences with a corrected p below 0.05 are called real, at most 5% of such tables have a
-        false call, provided that each p value holds by itself.
+        [n]. If each single p value is valid, the probability of any false positive below 0.05 is at most 5%.
 
     >>> holm(np.array([0.03, 0.01, math.nan, 0.04])).round(2).tolist()
     [0.06, 0.03, nan, 0.06]
@@ -295,13 +305,39 @@ def _rounding(values: Floats, baseline: Floats) -> float:
     return ROUNDING * float(np.max(np.abs([*values, *baseline]), initial=0.0))
 
 
-def _t_test(difference: float, error: float, degrees: float, *, runs: int, rounding: float) -> Difference:
-    """Return Student's t 95% interval and two-sided test of a difference with a standard error."""
+def _reach(error: float, degrees: float) -> float:
+    """Return half the length of Student's t 95% interval."""
+    return float(stdtrit(degrees, 0.5 + CONFIDENCE / 2.0)) * error
+
+
+def _t_test(
+    difference: float,
+    error: float,
+    degrees: float,
+    *,
+    runs: int,
+    apart: Floats,
+    tie: float,
+    rounding: float,
+) -> Difference:
+    """Return Student's t 95% interval and two-sided test of a difference with a standard error.
+
+    Args:
+        difference: of two means.
+        error: its standard error.
+        degrees: of freedom.
+        runs: n, the smaller number of the two sides.
+        apart: the differences of single runs, of any shape.
+        tie: up to which such a difference is none.
+        rounding: how far apart equal values may be by rounding.
+    """
     if runs < 2:
         return Difference(difference, math.nan, math.nan, runs, True, math.nan)
-    reach = float(stdtrit(degrees, 0.5 + CONFIDENCE / 2.0)) * error
-    if error <= rounding:
-        p_value = 1.0 if abs(difference) <= rounding else math.nan
+    reach = _reach(error, degrees)
+    if (np.abs(apart) <= max(tie, rounding)).all():
+        p_value = 1.0
+    elif error <= rounding:
+        p_value = math.nan
     else:
         p_value = 2.0 * float(stdtr(degrees, -abs(difference) / error))
     return Difference(difference, difference - reach, difference + reach, runs, False, p_value)

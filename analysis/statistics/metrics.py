@@ -9,28 +9,21 @@ finite and its table was recorded; otherwise they are means over episodes.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
 from enum import StrEnum
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from recrl.analysis.data.labels import BASELINE, GROUP, KEY
+from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.statistics.intervals import (
-    Interval,
-    group_difference,
-    holm,
-    improvement_interval,
     interquartile_mean,
     mean_and_standard_error,
-    paired_difference,
     stratified_bootstrap,
     wilson_interval,
 )
-from recrl.analysis.statistics.verdicts import is_cost, solved, tie, within_limits, worst_costs
+from recrl.analysis.statistics.verdicts import is_cost, solved, within_limits, worst_costs
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.spec import TrialStatus
 
@@ -197,161 +190,6 @@ def robust_summary(rows: pd.DataFrame, generator: np.random.Generator) -> pd.Dat
             | {"iqm_low": interval.low, "iqm_high": interval.high, "too_few_seeds": interval.is_small}
         )
     return pd.DataFrame(lines)
-
-
-def comparisons(
-    rows: pd.DataFrame, generator: np.random.Generator, *, baseline: str = BASELINE
-) -> pd.DataFrame:
-    """Compare every method with one of them, paired: one row per other GROUP and measure with a common seed.
-
-    All pairs count, feasible or not. More return is a gain only where feasible_pairs equals pairs.
-
-    Args:
-        rows: of ``outcomes``.
-        generator: draws the resamples.
-        baseline: name (label) of the method that the others are compared with.
-
-    The p values are corrected for the rows that are given: choose tasks, agents and methods before the call.
-
-    Returns:
-        GROUP, measure, baseline, pairs (seeds that both have), feasible_pairs (those whose trials are both
-        feasible); return_difference, the mean paired difference to the baseline, with Student's 95% interval
-        (_low, _high) and p value (_p; 1 if all pairs tie, NaN for one pair or without any spread);
-        return_difference_p_corrected, the p value corrected by ``holm`` for all rows of the measure; the same
-        for each cost_i_difference, corrected by itself; improvement, the probability that a run returns more
-        than a run of the baseline (of these seeds; ties count half), with its bootstrap interval (_low,
-        _high); too_few_seeds (the bootstrap interval is then too short). Ties are those of ``verdicts.tie``,
-        of costs only those by rounding.
-
-    Raises:
-        ValueError: no row has the given baseline, or a trial is in the rows twice. Without ``none`` the table
-            is empty by default.
-    """
-    _check_unique(rows)
-    if baseline != BASELINE:
-        _check_label(rows, "method", baseline)
-    lines = []
-    for line, *sides in _beside(rows, "method", baseline):
-        seeds = sides[0][["seed"]].merge(sides[1][["seed"]])
-        ours, theirs = (seeds.merge(side) for side in sides)
-        if len(seeds):
-            both = ours["feasible"].to_numpy(bool) & theirs["feasible"].to_numpy(bool)
-            line |= {"pairs": len(both), "feasible_pairs": int(both.sum())}
-            lines.append(line | _differences(ours, theirs, generator, paired=True))
-    return _compared(lines, rows, ["pairs", "feasible_pairs"])
-
-
-def group_comparisons(
-    rows: pd.DataFrame, generator: np.random.Generator, *, of: Literal["method", "agent"], baseline: str
-) -> pd.DataFrame:
-    """Compare methods, or agents, with one of them, as independent groups of seeds.
-
-    For runs that share little but the number of a seed, such as two agents. All seeds with a complete trial
-    count, feasible or not, also those that only one side has. More return is a gain only where all seeds of
-    both sides are feasible.
-
-    Args:
-        rows: of ``outcomes``.
-        generator: draws the resamples.
-        of: what is compared: methods with the same agent, or agents under the same method.
-        baseline: name (label) of the method, or agent, that the others are compared with.
-
-    Returns:
-        One row per other GROUP and measure, with the columns of ``comparisons``, but intervals and p values
-        of Welch's t test. A p value is 1 if every run ties every run of the baseline, and NaN if a side has
-        one seed. In place of the pairs are seeds and feasible_seeds, and those of the baseline:
-        baseline_seeds and baseline_feasible_seeds.
-
-    Raises:
-        ValueError: ``of`` is something else, no row has the given baseline, or a trial is in the rows twice.
-    """
-    if of not in ("method", "agent"):
-        raise ValueError(f"of: must be 'method' or 'agent', got {of!r}")
-    _check_unique(rows)
-    _check_label(rows, of, baseline)
-    lines = []
-    for line, ours, theirs in _beside(rows, of, baseline):
-        line |= {"seeds": len(ours), "feasible_seeds": int(ours["feasible"].sum())}
-        line |= {"baseline_seeds": len(theirs), "baseline_feasible_seeds": int(theirs["feasible"].sum())}
-        lines.append(line | _differences(ours, theirs, generator, paired=False))
-    counts = ["seeds", "feasible_seeds"]
-    return _compared(lines, rows, [*counts, *(f"baseline_{name}" for name in counts)])
-
-
-def _check_unique(rows: pd.DataFrame) -> None:
-    twice = rows[rows.duplicated([*KEY, "measure"])]
-    if len(twice):
-        names = ", ".join(str(twice.iloc[0][name]) for name in (*KEY, "measure"))
-        raise ValueError(f"rows: a trial is there twice: {names}")
-
-
-def _check_label(rows: pd.DataFrame, of: str, baseline: str) -> None:
-    if not (rows[of] == baseline).any():
-        known = ", ".join(map(str, dict.fromkeys(rows[of])))
-        raise ValueError(f"baseline: no complete trial has the {of} {baseline!r} (found: {known})")
-
-
-def _beside(
-    rows: pd.DataFrame, of: str, baseline: str
-) -> Iterator[tuple[dict[str, Any], pd.DataFrame, pd.DataFrame]]:
-    """Yield labels, outcomes and those of the baseline, for each other GROUP and measure that has both."""
-    same = [name for name in (*GROUP, "measure") if name != of]
-    bases = dict(iter(rows[rows[of] == baseline].groupby(same, observed=True)))
-    for group, chosen in rows.groupby([*GROUP, "measure"], observed=True, sort=False):
-        line: dict[str, Any] = dict(zip((*GROUP, "measure"), group, strict=True))
-        others = bases.get(tuple(line[name] for name in same))
-        if line[of] != baseline and others is not None:
-            yield line | {"baseline": baseline}, chosen, others
-
-
-def _differences(
-    ours: pd.DataFrame, theirs: pd.DataFrame, generator: np.random.Generator, *, paired: bool
-) -> dict[str, Any]:
-    """Return the differences in return and costs between two groups of outcomes.
-
-    Args:
-        ours: a row a seed.
-        theirs: of the baseline; if paired, with the same seeds in the same order.
-        generator: draws the resamples.
-        paired: whether rows of equal seeds are compared, or independent groups.
-    """
-    compare = paired_difference if paired else group_difference
-    tie_of_returns = tie(float(ours["optimal_return"].iloc[0]))
-    line: dict[str, Any] = {}
-    for name in ("episode_return", *filter(is_cost, map(str, ours))):
-        values, base = ours[name].to_numpy(np.float64), theirs[name].to_numpy(np.float64)
-        difference = compare(values, base)
-        apart = np.abs(values - base if paired else values[:, None] - base)
-        all_tie = bool((apart <= (tie_of_returns if name == "episode_return" else tie(math.nan))).all())
-        column = f"{name.removeprefix('episode_')}_difference"
-        p_value = 1.0 if all_tie and difference.runs > 1 else difference.p_value
-        line |= _ends(column, difference) | {f"{column}_p": p_value}
-    returns, base = (it["episode_return"].to_numpy(np.float64)[:, None] for it in (ours, theirs))
-    improvement = improvement_interval(returns, base, generator, tie=tie_of_returns)
-    return line | _ends("improvement", improvement) | {"too_few_seeds": improvement.is_small}
-
-
-def _compared(lines: Sequence[dict[str, Any]], rows: pd.DataFrame, counts: Sequence[str]) -> pd.DataFrame:
-    """Return a table of differences, with corrected p values; its columns exist even without a line.
-
-    Args:
-        lines: a mapping a row, without the corrected p values.
-        rows: the outcomes that were compared.
-        counts: names of the columns after the measure.
-    """
-    differing = [f"{name}_difference" for name in ("return", *filter(is_cost, map(str, rows)))]
-    ends = [f"{name}{end}" for name in differing for end in ("", "_low", "_high", "_p", "_p_corrected")]
-    improved = ["improvement", "improvement_low", "improvement_high", "too_few_seeds"]
-    table = pd.DataFrame(lines, columns=[*GROUP, "measure", "baseline", *counts, *ends, *improved])
-    of_measures = table.groupby("measure", sort=False)
-    for name in differing:
-        corrected = of_measures[f"{name}_p"].transform(lambda them: holm(them.to_numpy(np.float64)))
-        table[f"{name}_p_corrected"] = corrected
-    return table
-
-
-def _ends(name: str, interval: Interval) -> dict[str, float]:
-    return {name: interval.estimate, f"{name}_low": interval.low, f"{name}_high": interval.high}
 
 
 def _deployment(sweep: Sweep, costs: list[str]) -> pd.DataFrame:

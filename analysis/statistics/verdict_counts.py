@@ -33,7 +33,7 @@ def count_verdicts(
 
     Args:
         rows: of ``metrics.outcomes``.
-        compared: of ``metrics.comparisons``, with the baseline ``none``.
+        compared: of ``comparisons.comparisons``, with the baseline ``none``.
         flags: of ``sweep_warnings.curriculum_flags``.
         trials: of the sweep, complete or not.
         names: of ``cost_names``: the names of the costs of each task with several; their numbers by default.
@@ -49,7 +49,7 @@ def count_verdicts(
         deploy_limit_i, optimal_return, exact (whether every seed is; false without a seed), episodes (of a
         seed); deployment_return and deployment_cost_i (likewise, with _se); no_curriculum and hard_landing
         (seeds that have the flag); pairs, feasible_pairs and return_difference with _low and _high, as in
-        ``metrics.comparisons`` (NaN without a baseline).
+        ``comparisons.comparisons`` (NaN without a baseline).
     """
     final = rows[rows["measure"] == FINAL.value]
     deployed = rows[rows["measure"] == Measure.DEPLOYMENT.value]

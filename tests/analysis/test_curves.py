@@ -9,13 +9,7 @@ import pytest
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.statistics import curves
 from recrl.analysis.statistics.intervals import interquartile_mean, stratified_bootstrap
-
-
-def only(frame: pd.DataFrame, **values: object) -> pd.Series:
-    """The one row that has these values."""
-    chosen = frame.loc[np.logical_and.reduce([frame[name] == value for name, value in values.items()])]
-    assert len(chosen) == 1
-    return chosen.iloc[0]
+from tests.analysis.rows import only
 
 
 def curve_rows(rows: list[tuple[int, int, int, float]]) -> pd.DataFrame:

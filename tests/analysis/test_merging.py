@@ -13,6 +13,7 @@ from recrl.analysis.data.merging import merge
 from recrl.analysis.data.sweep_data import ROWS, Sweep, TrialFacts
 from recrl.analysis.report import drawing
 from recrl.analysis.statistics import metrics
+from recrl.analysis.statistics.comparisons import comparisons
 from recrl.analysis.statistics.cumulative_cost import cumulative_costs
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError
@@ -99,7 +100,7 @@ def test_trials_of_other_limits_stay_apart_and_are_compared_with_their_own_basel
     assert [label.partition(" [")[0] for label in labels] == ["a", "a"]
     assert merged.notes[0].startswith("2 tasks have the label a but different settings; they are kept apart ")
     assert "(deploy_limits [5.0])" in merged.notes[0]
-    compared = metrics.comparisons(metrics.outcomes(merged), np.random.default_rng(0))
+    compared = comparisons(metrics.outcomes(merged), np.random.default_rng(0))
     assert set(compared["task"]) == set(labels)
     assert set(compared["method"]) == {"dynamic"}
 
@@ -110,14 +111,14 @@ def test_methods_on_other_limits_and_budgets_are_not_compared(part: Part) -> Non
         part("linear", methods=("linear",), deploy_limit=5.0, updates=40),
     ]
     merged = merge(parts)
-    assert metrics.comparisons(metrics.outcomes(merged), np.random.default_rng(0)).empty
+    assert comparisons(metrics.outcomes(merged), np.random.default_rng(0)).empty
     assert set(merged.trials["method"]) == {"none", "linear"}
     (note,) = merged.notes
     assert note.startswith("2 tasks have the label a but different settings")
     assert "(deploy_limits [1.0], train_steps 7600, deploy_steps 400)" in note
     same = merge([parts[0], part("like-it", methods=("linear",), deploy_limit=1.0)])
     assert same.notes == ()
-    assert len(metrics.comparisons(metrics.outcomes(same), np.random.default_rng(0)))
+    assert len(comparisons(metrics.outcomes(same), np.random.default_rng(0)))
 
 
 def test_policies_are_evaluated_on_their_own_task(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pandas as pd
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report import table_files, table_formats
 from recrl.analysis.statistics import metrics
+from recrl.analysis.statistics.comparisons import comparisons
 from recrl.analysis.statistics.cumulative_cost import cumulative_costs
 from recrl.analysis.statistics.metrics import Measure
 
@@ -50,7 +51,7 @@ def test_shares_have_an_interval_from_five_seeds_on_and_violators_no_regret(fini
 
 def test_intervals_from_too_few_seeds_are_marked(finished: Sweep) -> None:
     rows = metrics.outcomes(finished)
-    compared = metrics.comparisons(rows, np.random.default_rng(0))
+    compared = comparisons(rows, np.random.default_rng(0))
     chosen = table_formats.compared_rows(compared, metrics.summary(rows, finished.trials), Measure.STOCHASTIC)
     table = table_formats.comparison_table(chosen)
     assert table["P(higher return)"].str.endswith("†").all()
@@ -59,7 +60,7 @@ def test_intervals_from_too_few_seeds_are_marked(finished: Sweep) -> None:
 
 def test_p_values_of_gains_are_shown_where_there_are_two_seeds(finished: Sweep, tmp_path: Path) -> None:
     rows = metrics.outcomes(finished)
-    compared = metrics.comparisons(rows, np.random.default_rng(0))
+    compared = comparisons(rows, np.random.default_rng(0))
     chosen = table_formats.compared_rows(compared, metrics.summary(rows, finished.trials), Measure.STOCHASTIC)
     chosen.loc[0, "return_difference_p_corrected"] = 0.0123
     chosen.loc[1, ["return_difference_p", "return_difference_p_corrected"]] = math.nan  # of one seed
@@ -77,7 +78,7 @@ def test_p_values_of_gains_are_shown_where_there_are_two_seeds(finished: Sweep, 
 def test_more_return_of_an_infeasible_policy_is_no_gain_and_one_seed_has_no_mark(finished: Sweep) -> None:
     rows = metrics.outcomes(finished)
     rows = rows[rows["seed"] == 0]
-    compared = metrics.comparisons(rows, np.random.default_rng(0))
+    compared = comparisons(rows, np.random.default_rng(0))
     chosen = table_formats.compared_rows(compared, metrics.summary(rows, finished.trials), Measure.STOCHASTIC)
     assert table_formats.row_kinds(chosen) == [""] * len(chosen)
     chosen.loc[0, ["feasible_seeds", "feasible_pairs"]] = 0

@@ -11,7 +11,7 @@ import pytest
 from recrl.analysis.data.labels import KEY
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report import html_page, verdict_texts
-from recrl.analysis.statistics import metrics
+from recrl.analysis.statistics.comparisons import comparisons
 from recrl.analysis.statistics.verdict_counts import count_verdicts
 
 NONE_COMPARED = pd.DataFrame()
@@ -116,7 +116,7 @@ def test_several_intervals_are_said_to_be_uncorrected() -> None:
     ]
     trials = trials_of(rows)
     flags = trials[list(KEY)].assign(no_curriculum=False, hard_landing=False)
-    compared = metrics.comparisons(pd.DataFrame(rows), np.random.default_rng(0))
+    compared = comparisons(pd.DataFrame(rows), np.random.default_rng(0))
     table = count_verdicts(pd.DataFrame(rows), compared, flags, trials)
     sentence = "Intervals in this table: 2, of 95% each, not corrected for their number."
     assert sentence in verdict_texts.explanation(table)
@@ -273,7 +273,7 @@ def test_a_difference_to_none_needs_feasible_policies_on_both_sides() -> None:
         ([row | {"feasible": True} for row in rows[:3]], "0.50 [0.50, 0.50]"),
     ):
         made = pd.DataFrame([*none, *rows[3:]])
-        compared = metrics.comparisons(made, np.random.default_rng(0))
+        compared = comparisons(made, np.random.default_rng(0))
         table = verdict_texts.verdict_table(count_verdicts(made, compared, flags, trials))
         assert table["difference to none"].tolist() == ["–", shown]
         assert compared["feasible_pairs"].tolist() == [2 if shown == "–" else 3]
@@ -284,7 +284,7 @@ def test_a_difference_over_fewer_seeds_has_its_own_number() -> None:
     rows = [outcome("none", 0, 9.0, 5.0), *(outcome("linear", seed, 9.5, 5.0) for seed in range(3))]
     trials = trials_of(rows)
     flags = trials[list(KEY)].assign(no_curriculum=False, hard_landing=False)
-    compared = metrics.comparisons(pd.DataFrame(rows), np.random.default_rng(0))
+    compared = comparisons(pd.DataFrame(rows), np.random.default_rng(0))
     table = verdict_texts.verdict_table(count_verdicts(pd.DataFrame(rows), compared, flags, trials))
     assert table["difference to none"].tolist() == ["–", "0.50 (n = 1)"]
     assert table["n"].tolist() == ["1", "3"]
