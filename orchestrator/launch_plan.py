@@ -9,7 +9,7 @@ import os
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.only_selection import select
 from recrl.orchestrator.provenance.code_changes import CodeComparison, InstalledCode, compare_files
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
+from recrl.orchestrator.trial_warnings import code_warnings
 
 # Proportional set size of a trial's process with torch, and of Ray's daemons with the driver and the MLflow
 # sync; rounded up from readings with Ray 2.60 and torch 2.13. A task's own buffers are additional.
@@ -123,19 +124,15 @@ class Plan:
         return tuple(it for it in self.trials if it.code.differs and it.action is not PlannedAction.RERUN)
 
     @property
-    def missing_modules(self) -> tuple[frozenset[str], ...]:
-        """Return the missing modules of each trial that is not run again."""
-        return tuple(it.code.missing for it in self.trials if it.action is not PlannedAction.RERUN)
+    def code_warnings(self) -> list[str]:
+        """Sentences on the code of the trials that are not run again.
 
-    @property
-    def other_versions(self) -> tuple[frozenset[str], ...]:
-        """Return the other versions of libraries that a kept trial ran with, by trial.
-
-        It is empty if nothing is to do, because then no versions are mixed.
+        Other versions of libraries are named only if something is to do, because else nothing is mixed.
         """
-        if not self.to_do:
-            return ()
-        return tuple(it.code.versions for it in self.trials if it.action is not PlannedAction.RERUN)
+        kept = [it for it in self.trials if it.action is not PlannedAction.RERUN]
+        if self.to_do:
+            return code_warnings([(it.record.status, it.code) for it in kept])
+        return code_warnings([(it.record.status, replace(it.code, versions=frozenset())) for it in kept])
 
     @property
     def counts(self) -> Mapping[PlannedAction, int]:

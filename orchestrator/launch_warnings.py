@@ -1,19 +1,14 @@
-"""Warnings before trials run: unknown horizons, no deployment phase, other code, trials left out."""
+"""Warnings before trials run: unknown horizons, no deployment phase, trials left out."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from recrl.orchestrator.counting import counted
-from recrl.orchestrator.files.trial_warnings import no_deployment_sentence, unknown_horizon_sentence
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.launch_plan import Plan
-from recrl.orchestrator.provenance.code_changes import (
-    missing_modules_sentence,
-    other_code_sentence,
-    other_versions_sentence,
-)
-from recrl.orchestrator.spec import TrialSpec, TrialStatus
+from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.trial_warnings import no_deployment_sentence, unknown_horizon_sentence
 
 
 def grid_warnings(grid: GridSpec, specs: Sequence[TrialSpec]) -> list[str]:
@@ -25,18 +20,6 @@ def grid_warnings(grid: GridSpec, specs: Sequence[TrialSpec]) -> list[str]:
     """
     endless = [cell.task.label for cell in grid.tasks if cell.horizon is None]
     return [*filter(None, (unknown_horizon_sentence(endless), no_deployment_sentence(specs)))]
-
-
-def code_warnings(plan: Plan) -> list[str]:
-    """Return sentences on trials that ran other code or libraries than now, or code that is not found."""
-    changed = plan.other_code
-    complete = sum(trial.record.status is TrialStatus.COMPLETE for trial in changed)
-    sentences = (
-        other_code_sentence(complete, len(changed) - complete),
-        missing_modules_sentence(plan.missing_modules),
-        other_versions_sentence(plan.other_versions),
-    )
-    return [*filter(None, sentences)]
 
 
 def left_out_sentence(plan: Plan) -> str:

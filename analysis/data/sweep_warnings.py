@@ -11,21 +11,17 @@ import pandas as pd
 
 from recrl.analysis.data.labels import BASELINE, KEY, listed
 from recrl.analysis.data.sweep_data import Sweep, TrialFacts
-from recrl.orchestrator.files.trial_warnings import (
-    HARD_LANDING,
+from recrl.orchestrator.files.trial_files import HARD_LANDING
+from recrl.orchestrator.provenance.code_changes import InstalledCode, compare, library_versions
+from recrl.orchestrator.spec import TrialStatus
+from recrl.orchestrator.trial_warnings import (
     NAMED,
     hard_landing_sentence,
     landed_hard,
-    no_curriculum_sentence,
-)
-from recrl.orchestrator.provenance.code_changes import (
-    InstalledCode,
-    compare,
-    library_versions,
     missing_modules_sentence,
+    no_curriculum_sentence,
     other_code_sentence,
 )
-from recrl.orchestrator.spec import TrialStatus
 
 _Ran = Mapping[str, set[str]]  # digests of code, or versions, by the name of the package
 

@@ -25,7 +25,7 @@ from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import IN_FORCE_COLOUR, LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
 from recrl.analysis.statistics.curves import Extent, mean_curve
 from recrl.environments.cmdp import Floats
-from recrl.orchestrator.files.trial_warnings import POLICY_NOISE
+from recrl.orchestrator.files.trial_files import POLICY_NOISE
 
 BINS = 100
 RECOVERY_CASE = 2.0  # CPO's ``case`` of a step that only decreases the cost

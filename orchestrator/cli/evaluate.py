@@ -16,17 +16,11 @@ from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.only_selection import parse_only, select
-from recrl.orchestrator.provenance.code_changes import (
-    InstalledCode,
-    compare_files,
-    missing_modules_sentence,
-    other_code_sentence,
-    other_versions_sentence,
-)
-from recrl.orchestrator.spec import TrialStatus
+from recrl.orchestrator.provenance.code_changes import InstalledCode, compare_files
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
+from recrl.orchestrator.trial_warnings import code_warnings
 
 if TYPE_CHECKING:
     from recrl.agents.evaluation import FrozenPolicy
@@ -92,15 +86,14 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
 def _warn_of_other_code(evaluated: Sequence[SavedTrial], console: Console) -> None:
     """Print the numbers of trials that ran other code or libraries than now, or code that is not found."""
     installed = InstalledCode()
-    codes = [compare_files(saved.store, saved.spec, installed) for saved in evaluated]
-    changed = [saved for saved, code in zip(evaluated, codes, strict=True) if code.differs]
-    complete = sum(saved.store.record().status is TrialStatus.COMPLETE for saved in changed)
-    if sentence := other_code_sentence(complete, len(changed) - complete):
-        say(console, f"warning: {sentence}; these evaluations use the installed code")
-    if sentence := missing_modules_sentence(code.missing for code in codes):
+    ran = [
+        (saved.store.record().status, compare_files(saved.store, saved.spec, installed))
+        for saved in evaluated
+    ]
+    for sentence in code_warnings(ran):
         say(console, f"warning: {sentence}")
-    if sentence := other_versions_sentence(code.versions for code in codes):
-        say(console, f"warning: {sentence}; these evaluations use the installed versions")
+    if any(code.differs or code.versions for _, code in ran):
+        say(console, "These evaluations use the code and the libraries that are installed now.")
 
 
 def _film(

@@ -19,7 +19,7 @@ from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.grid.only_selection import parse_only
 from recrl.orchestrator.launch_grid import room
 from recrl.orchestrator.launch_plan import Plan, TrialSelection, estimate, kind_of, make_plan, unmeasured
-from recrl.orchestrator.launch_warnings import code_warnings, grid_warnings
+from recrl.orchestrator.launch_warnings import grid_warnings
 from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.spec import TrialSpec
 
@@ -115,5 +115,5 @@ def _warn_of_steps(grid: GridSpec, specs: Sequence[TrialSpec], console: Console)
 
 def say_other_code(plan: Plan, console: Console) -> None:
     """Print the numbers of trials that ran other code or libraries than now, or code that is not found."""
-    for sentence in code_warnings(plan):
+    for sentence in plan.code_warnings:
         say(console, f"warning: {sentence}")

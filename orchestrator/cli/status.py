@@ -18,11 +18,6 @@ from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.files.trial_warnings import (
-    hard_landing_sentence,
-    landed_hard,
-    no_curriculum_sentence,
-)
 from recrl.orchestrator.launch_plan import make_plan
 from recrl.orchestrator.run_sweep import REQUEST_SECONDS
 from recrl.orchestrator.spec import TrialStatus
@@ -33,6 +28,11 @@ from recrl.orchestrator.sweep_progress import (
     display_status,
     progress,
     shown_record,
+)
+from recrl.orchestrator.trial_warnings import (
+    hard_landing_sentence,
+    landed_hard,
+    no_curriculum_sentence,
 )
 
 

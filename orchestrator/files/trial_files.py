@@ -25,6 +25,7 @@ UPDATE_COLUMNS = (
     "update_seconds",
 )
 EVALUATION_COLUMNS = ("policy", "index", "length", "episode_return")
+HARD_LANDING, POLICY_NOISE = "hard landing", "policy noise"  # events that warnings and figures use
 
 
 class FileKind(Enum):

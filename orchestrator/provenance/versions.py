@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 DISTRIBUTION = "recrl"
+LIBRARIES = ("gymnasium", "minigrid", "mujoco", "numba", "numpy", "scipy", "torch")  # that affect results
 _GIT_SECONDS = 10.0
 
 

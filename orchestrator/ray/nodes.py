@@ -16,8 +16,9 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from recrl.orchestrator.errors import ClusterError, first_line
 from recrl.orchestrator.launch_plan import trials_on_gpus
+from recrl.orchestrator.provenance.versions import DISTRIBUTION, LIBRARIES
 
-DISTRIBUTIONS = ("recrl", "ray", "torch", "numpy")
+DISTRIBUTIONS = (DISTRIBUTION, "ray", *LIBRARIES)
 ANSWER_SECONDS = 180.0  # a node may have to start its first process
 ACCESS_PROBLEM = "what keeps it from the results"
 

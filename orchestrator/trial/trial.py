@@ -32,7 +32,7 @@ from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector
 from recrl.environments.vector import CMDPVectorEnv
 from recrl.orchestrator.errors import USERS_ERRORS, described
-from recrl.orchestrator.files.trial_warnings import HARD_LANDING, POLICY_NOISE
+from recrl.orchestrator.files.trial_files import HARD_LANDING, POLICY_NOISE
 from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.agent_answers import checked_metrics, checked_noise

@@ -20,11 +20,11 @@ from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.files.trial_warnings import HARD_LANDING, landed_hard, no_curriculum_sentence
+from recrl.orchestrator.files.trial_files import HARD_LANDING
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.launch_plan import PlannedAction, TrialSelection, make_plan
-from recrl.orchestrator.provenance import code_changes, versions
+from recrl.orchestrator.provenance import code_changes, project_files, versions
 from recrl.orchestrator.provenance.code_changes import (
     CHANGED,
     CodeComparison,
@@ -32,15 +32,19 @@ from recrl.orchestrator.provenance.code_changes import (
     code_of,
     compare,
     compare_files,
-    missing_modules_sentence,
-    other_code_sentence,
-    other_versions_sentence,
 )
 from recrl.orchestrator.ray.tune_callbacks import DriverWatch
 from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_sweep
 from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.sweep_progress import DisplayStatus, progress
+from recrl.orchestrator.trial_warnings import (
+    landed_hard,
+    missing_modules_sentence,
+    no_curriculum_sentence,
+    other_code_sentence,
+    other_versions_sentence,
+)
 from tests.orchestrator.launches import INLINE
 
 TASK = """\
@@ -73,6 +77,7 @@ SENTENCE = (
     "warning: 1 complete trial comes from other code than is installed now; launch --rerun-changed runs it "
     "again"
 )
+INSTALLED = "These evaluations use the code and the libraries that are installed now."
 
 
 @pytest.fixture
@@ -115,7 +120,8 @@ def test_a_changed_task_is_said_everywhere_and_run_again_when_asked(
     assert main(["status", "--brief"]) == ExitCode.OK
     assert SENTENCE in capsys.readouterr().out.splitlines()
     assert main(["evaluate", "small", "--policy", "stochastic", "--trust"]) == ExitCode.OK
-    assert f"{SENTENCE}; these evaluations use the installed code" in capsys.readouterr().out.splitlines()
+    printed = capsys.readouterr().out.splitlines()
+    assert {SENTENCE, INSTALLED} <= set(printed)
     assert SENTENCE.removeprefix("warning: ") in pages.missing(sweep_data.load(store))
 
     assert main(["launch", "grid.yaml", *INLINE, "--rerun-changed"]) == ExitCode.OK
@@ -282,7 +288,7 @@ def test_a_failed_trial_of_other_code_is_run_again_too(folder: Path) -> None:
     assert store.trial(spec).record().status is TrialStatus.FAILED
     change(folder)
     result = _rerun(grid, store, InlineExecutor())
-    assert not result.plan.other_code
+    assert not result.plan.code_warnings
     assert store.trial(spec).record().status is TrialStatus.COMPLETE
     assert not store.trial(spec).error_path.exists()
 
@@ -383,7 +389,7 @@ def test_the_imports_of_a_plug_in_are_followed_within_its_project_and_bounds(
     (elsewhere / "my_elsewhere.py").write_text("")
     monkeypatch.syspath_prepend(elsewhere)
     assert list(InstalledCode().of(spec)) == ["recrl", "my_scaled_task", "my_a", "my_b"]
-    monkeypatch.setattr(code_changes, "MOST_FILES", 2)
+    monkeypatch.setattr(project_files, "MOST_FILES", 2)
     assert list(InstalledCode().of(spec)) == ["recrl", "my_scaled_task", "my_a"]
 
 
@@ -448,8 +454,7 @@ def test_other_versions_of_libraries_are_said_where_a_launch_would_mix_them(
     assert main(["plan", "grid.yaml", "--trust"]) == ExitCode.OK
     assert sentence in capsys.readouterr().out.splitlines()
     assert main(["evaluate", "small", "--trust"]) == ExitCode.OK
-    evaluated = f"{sentence}; these evaluations use the installed versions"
-    assert evaluated in capsys.readouterr().out.splitlines()
+    assert {sentence, INSTALLED} <= set(capsys.readouterr().out.splitlines())
     assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
     assert sentence in capsys.readouterr().out.splitlines()
 

@@ -20,7 +20,7 @@ from recrl.environments.registry import make_vector
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files import trial_files
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.files.trial_warnings import HARD_LANDING, POLICY_NOISE
+from recrl.orchestrator.files.trial_files import HARD_LANDING, POLICY_NOISE
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.grid.file_models import GridFile
 from tests.project.documentation import DOCS, PAGES, README, ROOT, Fence, fences, label

@@ -1,0 +1,137 @@
+"""Warnings about trials: ineffective curricula, too few steps, endless tasks, other code or libraries."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Sequence
+
+from recrl.orchestrator.counting import counted
+from recrl.orchestrator.files.trial_files import HARD_LANDING
+from recrl.orchestrator.provenance.code_changes import CodeComparison
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
+from recrl.teachers.registry import is_known_control
+
+NAMED = 5  # trials in a sentence, at most
+
+
+def landed_hard(spec: TrialSpec, events: Iterable[str]) -> bool:
+    """Return whether deployment began far above d_d, although the curriculum is no control.
+
+    Args:
+        spec: the trial.
+        events: the names of its events.
+    """
+    return HARD_LANDING in events and not is_known_control(spec.method.name)
+
+
+def no_curriculum_sentence(titles: Sequence[str]) -> str:
+    """Return the warning about trials whose measured d_t is not above d_d; empty for none."""
+    what = "the measured d_t is not above d_d, so the limit is d_d after the measurement"
+    return _warning(what, titles, "give a finite train_limits above d_d")
+
+
+def hard_landing_sentence(titles: Sequence[str]) -> str:
+    """Return the warning about trials that ``landed_hard``; empty for none."""
+    what = "hard landing, the limit was still far above d_d when deployment began"
+    return _warning(
+        what, titles, "give the curriculum more steps or a smaller d_t, or dynamic a smaller window"
+    )
+
+
+def no_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
+    """Return the warning about trials without an update in the deployment phase; empty for none."""
+    what = "the deployment phase is shorter than an update, so that no update learns under d_d"
+    short = [spec for spec in specs if spec.lacks_deployment]
+    if not short:
+        return ""
+    rounding = 0.5  # of deploy_steps
+    times = max(math.ceil(spec.steps_per_update / (spec.deploy_steps - rounding)) for spec in short)
+    remedy = f"take {times} times the total_steps or a larger deploy_fraction"
+    return _warning(what, [spec.title for spec in short], remedy)
+
+
+def unknown_horizon_sentence(tasks: Sequence[str]) -> str:
+    """Return the warning about tasks that do not say how long an episode may be; empty for none."""
+    what = "unknown horizon, and an episode that never ends gives no result"
+    return _warning(
+        what,
+        tasks,
+        "let step return truncated=True, and give the environment an attribute horizon, or TimeLimit",
+    )
+
+
+def code_warnings(ran: Sequence[tuple[TrialStatus, CodeComparison]]) -> list[str]:
+    """Return sentences on trials that ran other code or libraries than now, or code that is not found.
+
+    Args:
+        ran: status and comparison of each trial.
+    """
+    changed = [status for status, code in ran if code.differs]
+    complete = changed.count(TrialStatus.COMPLETE)
+    sentences = (
+        other_code_sentence(complete, len(changed) - complete),
+        missing_modules_sentence(code.missing for _, code in ran),
+        other_versions_sentence(code.versions for _, code in ran),
+    )
+    return [*filter(None, sentences)]
+
+
+def other_code_sentence(complete: int, begun: int) -> str:
+    """Describe trials that ran other code; empty for none.
+
+    Args:
+        complete: complete ones.
+        begun: incomplete ones.
+    """
+    parts = []
+    if complete:
+        parts.append(counted(complete, "complete trial"))
+    if begun:
+        parts.append(counted(begun, "begun one" if complete else "begun trial"))
+    if not parts:
+        return ""
+    comes = "comes" if complete + begun == 1 else "come"
+    them = "it" if complete + begun == 1 else "them"
+    return (
+        f"{' and '.join(parts)} {comes} from other code than is installed now; launch --rerun-changed runs "
+        f"{them} again"
+    )
+
+
+def missing_modules_sentence(missing: Iterable[Collection[str]]) -> str:
+    """Describe trials whose code could not be compared; empty for none.
+
+    Args:
+        missing: ``CodeComparison.missing`` of each trial.
+    """
+    lacking = [names for names in missing if names]
+    if not lacking:
+        return ""
+    first, *others = sorted(set().union(*lacking))
+    subject = f"{first} and {counted(len(others), 'other')} were" if others else f"{first} was"
+    return (
+        f"the code of {counted(len(lacking), 'trial')} was not checked for changes, because the module "
+        f"{subject} not found; start the command in the folder that holds {'them' if others else 'it'}"
+    )
+
+
+def other_versions_sentence(versions: Iterable[Collection[str]]) -> str:
+    """Describe trials that ran with other versions of libraries; empty for none.
+
+    Args:
+        versions: ``CodeComparison.versions`` of each trial.
+    """
+    others = [changes for changes in versions if changes]
+    if not others:
+        return ""
+    listed = "; ".join(sorted(set().union(*others)))
+    return (
+        f"{counted(len(others), 'trial')} ran with other versions of libraries than are installed now "
+        f"({listed}); the same settings may give other results"
+    )
+
+
+def _warning(what: str, titles: Sequence[str], remedy: str) -> str:
+    """Return a warning that names the first trials; empty for none."""
+    more = f" and {len(titles) - NAMED} more" if len(titles) > NAMED else ""
+    return f"{what}: {', '.join(titles[:NAMED])}{more}; {remedy}" if titles else ""
