@@ -13,6 +13,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import load_env_creator
 from pydantic import BaseModel, Field, JsonValue, field_validator
 
 from recrl.environments.gymnasium_adapter import (
@@ -64,10 +65,25 @@ class GymnasiumOptions(Options):
 def make_gymnasium(name: str, num_envs: int, options: GymnasiumOptions) -> SyncCMDPVectorEnv:
     """B environments of a registered id."""
     keywords: dict[str, Any] = dict(options.keywords)
+    _check_keywords_of_id(options)
     factory = functools.partial(gymnasium.make, options.id, disable_env_checker=True, **keywords)
     return SyncCMDPVectorEnv(
         name, [factory] * num_envs, cost_names=options.cost_names, costless=options.costless
     )
+
+
+def _check_keywords_of_id(options: GymnasiumOptions) -> None:
+    """Check that the class of a registered id takes the keywords; ``gymnasium.make`` takes some itself.
+
+    Raises:
+        ValueError: it does not.
+    """
+    entry = gymnasium.spec(options.id.rpartition(":")[2]).entry_point
+    creator = load_env_creator(entry) if isinstance(entry, str) else entry
+    own = inspect.signature(gymnasium.make).parameters
+    if creator is not None:
+        others = {key: value for key, value in options.keywords.items() if key not in own}
+        check_keywords(creator, options.id, others)
 
 
 def keywords_of(factory: Callable[..., Environment]) -> str:

@@ -16,6 +16,9 @@ class RecrlError(Exception):
     """An error that a user can correct; its text is one clear sentence."""
 
 
+TRUST_HINT = "if you trust it, add --trust"  # the Python API has another one
+
+
 class GridError(RecrlError):
     """A grid file is wrong; ``problems`` holds one located sentence for each mistake."""
 
@@ -36,7 +39,7 @@ class UntrustedGridError(RecrlError):
         what = "was not called" if len(uncalled) == 1 else "were not called"
         super().__init__(
             f"{source}: {', '.join(uncalled)} {what}, because a file that is only read must run no code; "
-            "if you trust it, add --trust"
+            f"{TRUST_HINT}"
         )
         self.source = source
         self.uncalled = uncalled

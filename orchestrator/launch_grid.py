@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_files import of_update
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.file_models import Resources
@@ -114,7 +115,7 @@ class LaunchListener:
         """Called after the figures are drawn to a folder."""
 
     def failed_to_draw(self, error: Exception) -> None:
-        """Called if a bug in recrl prevents figures; the launch continues."""
+        """Called if figures or tables cannot be made; the launch continues."""
 
     def filming(self, trials: Sequence[TrialStore]) -> None:
         """Called before these trials are filmed."""
@@ -254,8 +255,6 @@ def _draw(sweep: Sweep, store: SweepStore, listener: LaunchListener) -> None:
     listener.drawing()
     try:
         drawing.draw(sweep, store.figures_folder)
-    except (RecrlError, OSError):
-        raise
     except Exception as error:
         logger.debug("figures of %s", store.name, exc_info=True)
         listener.failed_to_draw(error)
@@ -284,8 +283,8 @@ def _film(
     """Film complete trials without a video, if the grid requests it."""
     seeds = {"none": (), "first-seed": grid.seeds[:1], "all": grid.seeds}[grid.run.videos]
     complete = [trial.spec for trial in after.with_status(DisplayStatus.COMPLETE) if trial.spec.seed in seeds]
-    trials = map(store.trial, complete)
-    unseen = [trial for trial in trials if not any(trial.videos_folder.glob("update-*"))]
+    films = [(store.trial(spec), f"{of_update(spec.num_updates)}__*") for spec in complete]
+    unseen = [trial for trial, name in films if not any(trial.videos_folder.glob(name))]
     if not unseen:
         return
     from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415

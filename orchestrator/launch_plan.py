@@ -278,9 +278,8 @@ def _planned_action(record: TrialRecord, selection: TrialSelection) -> PlannedAc
         case TrialStatus.FAILED:
             return PlannedAction.RETRY if selection.retry_failed else PlannedAction.FAILED
         case TrialStatus.DAMAGED:
-            was_ended = record.claims in (TrialStatus.COMPLETE, TrialStatus.FAILED)
-            left_alone = was_ended and not selection.rerun_damaged
-            return PlannedAction.DAMAGED if left_alone else PlannedAction.REPAIR
+            is_left_alone = record.is_left_alone and not selection.rerun_damaged
+            return PlannedAction.DAMAGED if is_left_alone else PlannedAction.REPAIR
         case TrialStatus.WAITING | TrialStatus.RUNNING:
             return PlannedAction.RESUME if record.attempt else PlannedAction.NEW
 

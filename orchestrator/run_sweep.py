@@ -131,18 +131,15 @@ def _run(settings: SweepRunSettings, plan: Plan, stop: threading.Event) -> Sweep
     """Run the trials of a plan, with the MLflow sync in the background."""
     store = settings.place.store
     sync = settings.start_sync(store) if settings.start_sync is not None else None
-    patience = HASTY_SYNC_SECONDS
     synced: bool | None = None
     try:
         with _reruns_requested(plan, store):
             _run_trials(settings, plan.to_do, stop)
         after = progress([trial.spec for trial in plan.trials], store)
         settings.finish(after)
-        if not stop.is_set():
-            patience = SYNC_SECONDS
     finally:
         if sync is not None:
-            synced = sync.stop(patience)
+            synced = sync.stop(HASTY_SYNC_SECONDS if stop.is_set() else SYNC_SECONDS)
     return SweepResult(plan, after, stopped=stop.is_set(), synced=synced)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
-from recrl.orchestrator.files.stop_file import StopFile, StopSign
+from recrl.orchestrator.files.stop_file import StopFile, StopSignal
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
@@ -28,7 +28,7 @@ class SweepPlace:
     """
 
     uri = ""
-    shortest_silence_seconds = 0.0  # a shorter silence of a trial may be the way of its signs of life
+    shortest_silence_seconds = 0.0  # heartbeats arrive this late through an object store
 
     def __init__(self, store: SweepStore) -> None:
         self.store = store
@@ -106,10 +106,10 @@ class SweepPlace:
         """Return a folder for one attempt at a trial, on the machine that runs it."""
         return nullcontext(self.store.trial(spec))
 
-    def new_stop_sign(self) -> AbstractContextManager[StopSign]:
+    def new_stop_signal(self) -> AbstractContextManager[StopSignal]:
         """Return the stop signal of a new run; workers of earlier runs are stopped."""
         return StopFile.open(self.store.folder)
 
-    def stop_sign_at(self, place: str) -> StopSign:
-        """Return the stop sign that a run has made: its ``StopSign.place``."""
+    def stop_signal_at(self, place: str) -> StopSignal:
+        """Return the stop signal that a run has made: its ``StopSignal.place``."""
         return StopFile(Path(place))

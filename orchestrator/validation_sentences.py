@@ -112,6 +112,12 @@ def misspells(key: str, wanted: str, model: type[BaseModel]) -> bool:
     return key not in known and _intended(key, known) == wanted
 
 
+_PLACES = {  # where an unknown key may belong
+    "options": "an option goes below options",
+    "keywords": "an argument of the environment goes below keywords",
+}
+
+
 def as_written(value: Any) -> str:
     """Return a value as the user wrote it, cut to a readable length."""
     try:
@@ -135,7 +141,8 @@ def _unknown_key(key: str, known: list[str]) -> str:
     if meant := _intended(key, known):
         return f"unknown key; did you mean {meant!r}?"
     names = f" (known: {', '.join(known)})" if known else ""
-    return f"unknown key{names}{'; an option goes below options' if 'options' in known else ''}"
+    hints = "".join(f"; {hint}" for place, hint in _PLACES.items() if place in known)
+    return f"unknown key{names}{hints}"
 
 
 def model_in(annotation: Any) -> type[BaseModel] | None:

@@ -32,6 +32,7 @@ Notation: N samples, k costs, of which j have a finite limit.
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from recrl.agents.algorithms.own_options import CRPOConfig
 from recrl.agents.building_blocks.advantages import standardised_advantages
@@ -51,34 +52,36 @@ from recrl.agents.trust_region.local_model import LocalModel, improvement, linea
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
-def most_violated(gaps: Floats, spreads: Floats, tolerance: float) -> int | None:
-    """Return the cost to decrease, or None if all gaps are within the tolerance.
+def most_violated(
+    gaps: Floats, spreads: Floats, tolerance: float, influenced: npt.NDArray[np.bool_]
+) -> int | None:
+    """Return the cost to decrease, or None if all gaps that a step can change are within the tolerance.
 
     Args:
         gaps: mean episode cost minus limit, [k]; -inf where there is no constraint.
         spreads: standard deviations of the costs' advantages, [k], above 0.
         tolerance: eta, in episode cost, at least 0.
+        influenced: whether a step changes the cost to first order, [k].
 
-    >>> most_violated(np.array([3.0, 2.0, -9.0]), np.array([2.0, 1.0, 1.0]), 0.5)
+    >>> most_violated(np.array([3.0, 2.0, -9.0]), np.array([2.0, 1.0, 1.0]), 0.5, np.full(3, True))
     1
     """
-    violated = gaps > tolerance
+    violated = (gaps > tolerance) & influenced
     if not violated.any():
         return None
     return int(np.argmax(np.where(violated, gaps / spreads, -np.inf)))
 
 
 def cost_step(problem: StepProblem, corrected: int, config: CRPOConfig) -> DualSolution:
-    """Return the module's step that decreases one of the j costs."""
+    """Return the module's step that decreases one of the j costs, which a step must be able to change."""
     squared = float(problem.gram[corrected, corrected])
     weights = np.zeros_like(problem.violations)
-    if squared > NO_INFLUENCE:
-        weights[corrected] = np.sqrt(2.0 * problem.radius / squared)
-        if config.kl_penalty > 0.0:
-            beyond = overshoot(problem, config) * max(-float(problem.mixed[corrected]), 0.0)
-            weights[corrected] = min(
-                weights[corrected], (float(problem.violations[corrected]) + beyond) / squared
-            )
+    weights[corrected] = np.sqrt(2.0 * problem.radius / squared)
+    if config.kl_penalty > 0.0:
+        beyond = overshoot(problem, config) * max(-float(problem.mixed[corrected]), 0.0)
+        weights[corrected] = min(
+            weights[corrected], (float(problem.violations[corrected]) + beyond) / squared
+        )
     return DualSolution(StepCase.RECOVERY, 0.0, weights, np.full_like(weights, np.nan), (corrected,))
 
 
@@ -122,10 +125,12 @@ class ConstraintRectifiedPolicyOptimisation:
             stayed = {"policy_steps": 0.0, "line_search_steps": float("nan"), "step_norm": 0.0}
             return {**stayed, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
         advantages, spreads = standardised_advantages(experience.advantages)
-        corrected = most_violated(constraints.gaps, spreads[1:], config.tolerance)
         active = ActiveConstraints.of(constraints).divided_by(spreads[1:])
         model = LocalModel(policy, experience, advantages)
         problem, solved = linearise(model, active, model.metric(config, generator), config)
+        influenced = np.full(len(constraints.gaps), False)
+        influenced[active.index] = np.diag(problem.gram) > NO_INFLUENCE
+        corrected = most_violated(constraints.gaps, spreads[1:], config.tolerance, influenced)
         multipliers = np.zeros_like(constraints.limits)
         if corrected is None:
             solution = reward_step(problem, config)

@@ -21,7 +21,7 @@ GOAL, BOX, BUTTONS, HAZARDS, VASES, PILLARS, GREMLINS = range(7)
 TERMS = ("hazards", "vases_contact", "vases_velocity", "pillars", "buttons", "gremlins")
 """All cost terms, in the order in which they are computed."""
 SENSORS = ("accelerometer", "velocimeter", "gyro", "magnetometer", "ballquat_rear", "ballangvel_rear")
-"""Sensors of a robot, in the order of the field ``TASK["sensor"]``."""
+"""Sensors of a robot, in the order of the field ``TASK["sensors"]``."""
 ACCELEROMETER, VELOCIMETER, GYRO, MAGNETOMETER, BALL, SPIN = range(6)
 FLAGS = ("goal_met", "truncated")
 """Results of a step besides rewards, costs and the indicators of the cost terms."""

@@ -1,4 +1,4 @@
-"""A curriculum that reads episodes: halve the distance to d_d whenever the last episodes kept the limit."""
+"""A curriculum that reads episodes: a kept limit moves halfway from their mean cost to d_d."""
 
 from statistics import fmean
 
@@ -51,7 +51,7 @@ class Halving:
 
 
 HALVING = TeacherKind(
-    "Halve the distance to d_d when the last episodes kept the limit.",
+    "A limit that the last episodes kept moves halfway from their mean cost to d_d.",
     HalvingConfig,
     Halving,
     compares_costs=True,

@@ -11,7 +11,7 @@ from recrl.environments.plugins import UntrustedNameError
 from recrl.orchestrator.cli import display
 from recrl.orchestrator.cli.output import print_table, say
 from recrl.orchestrator.cli.requests import ListRequest, OptionsRequest, SchemaRequest
-from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
+from recrl.orchestrator.errors import TRUST_HINT, USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid.catalogue import KINDS, LISTS, SECTIONS, Kind, kinds_of, listed, options_of
 from recrl.orchestrator.grid.json_schema import grid_schema
@@ -62,7 +62,7 @@ def _kinds(name: str) -> list[Kind]:
     try:
         return kinds_of(name)
     except UntrustedNameError as error:
-        raise RecrlError(f"{error}; if you trust it, add --trust") from error
+        raise RecrlError(f"{error}; {TRUST_HINT}") from error
     except RecrlError:
         raise
     except USERS_ERRORS as error:

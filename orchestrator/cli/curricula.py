@@ -13,7 +13,7 @@ from recrl.orchestrator.cli.output import say, short, show
 from recrl.orchestrator.cli.requests import BoundRequest, ReplayRequest
 from recrl.orchestrator.cli.results import say_warnings, source
 from recrl.orchestrator.cli.sweeps import open_store
-from recrl.orchestrator.errors import USERS_ERRORS, DamagedError, RecrlError, described
+from recrl.orchestrator.errors import TRUST_HINT, USERS_ERRORS, DamagedError, RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.only_selection import parse_only, select
@@ -140,7 +140,7 @@ def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
     except NotJsonError as error:
         raise RecrlError(f"--option: {error}") from error
     except UntrustedNameError as error:
-        raise RecrlError(f"{error}; if you trust it, add --trust") from error
+        raise RecrlError(f"{error}; {TRUST_HINT}") from error
     except UnknownNameError as error:
         raise RecrlError(str(error)) from error
     except USERS_ERRORS as error:

@@ -19,7 +19,7 @@ from recrl.orchestrator.grid.only_selection import parse_only, select
 from recrl.orchestrator.provenance.code_changes import InstalledCode, compare_files
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.export_file import write_in_own_process
-from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
+from recrl.orchestrator.tracking.mlflow_sync import last_report, sync, without_export
 from recrl.orchestrator.trial_warnings import code_warnings
 
 if TYPE_CHECKING:
@@ -154,6 +154,8 @@ def _tell_mlflow(store: SweepStore, request: EvaluateRequest, console: Console) 
     if last_report(store, uri) is None:
         return
     report = sync(store, uri, write_export=write_in_own_process)
+    if report.remark:
+        say(console, f"MLflow     {without_export(report.remark)}")
     if not report.is_up_to_date:
         later = command_line("sync", store, request.tracking_uri)
         say(console, f"MLflow     is not up to date ({report.problem}); later: {later}")

@@ -17,7 +17,7 @@ from recrl.orchestrator.cli.requests import LaunchRequest
 from recrl.orchestrator.cli.status import say_failures
 from recrl.orchestrator.cli.sweeps import command_line
 from recrl.orchestrator.counting import counted
-from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.errors import RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
@@ -30,7 +30,7 @@ from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.run_sweep import SweepResult
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.sweep_progress import DisplayStatus, progress
-from recrl.orchestrator.tracking.mlflow_sync import last_report
+from recrl.orchestrator.tracking.mlflow_sync import last_report, without_export
 
 if TYPE_CHECKING:
     from recrl.analysis.data.sweep_data import Sweep
@@ -79,6 +79,9 @@ def launch_and_print(
     return _say_result(outcome.result, place, options, given, console)
 
 
+TRIALS_SAVE = "running trials save their state"
+
+
 class _Printer(LaunchListener):
     """Listener that prints what a launch does."""
 
@@ -87,6 +90,7 @@ class _Printer(LaunchListener):
         self._options = options
         self._console = console
         self._store = SweepStore(options.root, grid.name)
+        self._draws = False
 
     @contextmanager
     def planned(self, plan: Plan, *, at_once: int, where: str) -> Iterator[None]:
@@ -107,11 +111,13 @@ class _Printer(LaunchListener):
             yield
 
     def stopping(self) -> None:
-        """Print that trials save their state."""
-        say(self._console, "Stopping: running trials save their state. Press again to stop at once.")
+        """Print that trials save their state, or that they have ended."""
+        what = "no trial runs any more; figures or MLflow may be left out" if self._draws else TRIALS_SAVE
+        say(self._console, f"Stopping: {what}. Press again to stop at once.")
 
     def drawing(self) -> None:
         """Print that figures are being drawn: it takes long."""
+        self._draws = True
         say(self._console, "Drawing figures ...")
 
     def drawn(self, folder: Path) -> None:
@@ -120,9 +126,12 @@ class _Printer(LaunchListener):
 
     def failed_to_draw(self, error: Exception) -> None:
         """Print the error, and how to see its traceback."""
-        reason = f"({type(error).__name__}: {error}), because of a bug in recrl"
-        say(self._console, f"Figures    not all are drawn {reason}")
-        say(self._console, f"           for its traceback: {command_line('figures', self._store)}")
+        say(self._console, f"Figures    not all are drawn ({described(error)})")
+        if isinstance(error, RecrlError | OSError):
+            say(self._console, f"           to draw them later: {command_line('figures', self._store)}")
+        else:
+            traceback = command_line("figures", self._store)
+            say(self._console, f"           this is a bug in recrl; for its traceback: {traceback}")
 
     def filming(self, trials: Sequence[TrialStore]) -> None:
         """Print the place of the videos."""
@@ -155,8 +164,10 @@ def _say_synced(outcome: LaunchOutcome, uri: str, options: LaunchOptions, consol
     where = redacted(uri) if options.tracking_uri else short(store.mlflow_database)
     say(console, f"MLflow     {where}")
     say(console, f"           {command_line('ui', store, options.tracking_uri)}")
+    report = last_report(store, uri)
+    if report and report.remark:
+        say(console, f"           {without_export(report.remark)}")
     if not outcome.result.synced:  # a sync that was killed leaves the report of an earlier pass
-        report = last_report(store, uri)
         problem = f" ({report.problem})" if report and report.problem else ""
         again = command_line("sync", store, options.tracking_uri)
         say(console, f"           MLflow is not up to date{problem}; nothing is lost: {again}")

@@ -11,7 +11,8 @@ from recrl.analysis.data.number_texts import number, with_error
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import curriculum_flags
 from recrl.analysis.report.table_formats import names_of
-from recrl.analysis.report.verdict_texts import all_exact, measured_how, tolerance_sentence, verdict_text
+from recrl.analysis.report.verdict_table import verdict_text
+from recrl.analysis.report.verdict_terms import all_exact, measured_how, tolerance_sentence
 from recrl.analysis.statistics.metrics import outcomes
 from recrl.analysis.statistics.verdict_counts import count_verdicts
 from recrl.analysis.statistics.verdicts import SOLVED_GAP

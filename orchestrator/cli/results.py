@@ -82,7 +82,7 @@ def _say_file(path: Path, sweep: Sweep, console: Console) -> None:
 
 
 def source(request: SourceRequest) -> tuple[Sweep, Path]:
-    """Yield the sweep, from its files, an export or MLflow, and a folder for figures."""
+    """Return the sweep, from its files, an export or MLflow, and a folder for figures."""
     from recrl.analysis.data import export, from_mlflow, sweep_data  # noqa: PLC0415  (imports pandas and SciPy)
 
     given: str | None = request.sweep

@@ -15,7 +15,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.tracking.client import one_line, tracking_uri
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.final_outcomes import FinalOutcomes
-from recrl.orchestrator.tracking.mlflow_sync import sync
+from recrl.orchestrator.tracking.mlflow_sync import sync, without_export
 from recrl.orchestrator.tracking.ui import open_ui
 
 
@@ -50,7 +50,7 @@ def run_sync(request: SyncRequest, console: Console) -> ExitCode:
         )
     say(console, f"MLflow shows all {report.trials} trials of {store.name}; {report.points} points were new")
     if report.remark:
-        say(console, f"without the export file ({report.remark}): MLflow still has the previous one")
+        say(console, without_export(report.remark))
     return ExitCode.OK
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import secrets
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +19,7 @@ from recrl.orchestrator.errors import DamagedError, OtherFormatError, StorageErr
 
 FORMAT_KEY = "format"
 SEAL_KEY = "sha256"
+_TEMPORARY = re.compile(r"\..+\.\d+\.[0-9a-f]{8}")  # names of ``write_atomically``
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -31,6 +33,13 @@ def write_atomically(path: Path, data: bytes) -> None:
         beside.replace(path)
     finally:
         beside.unlink(missing_ok=True)
+
+
+def remove_temporary_files(folder: Path) -> None:
+    """Remove what processes that were killed in ``write_atomically`` left; the caller is the only writer."""
+    for path in folder.glob(".*.*"):
+        if _TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:

@@ -10,17 +10,17 @@ from contextlib import contextmanager
 from pathlib import Path
 
 
-class StopSign(ABC):
+class StopSignal(ABC):
     """How one run of a sweep tells its workers, on any node, to save and stop.
 
     Attributes:
-        place: by which workers find it: see ``SweepPlace.stop_sign_at``.
+        place: by which workers find it: see ``SweepPlace.stop_signal_at``.
         uri: the address of the sweep in an object store, or empty.
-        question_seconds: between two looks of a worker, at least.
+        poll_seconds: least time between two reads of a worker.
     """
 
     uri = ""
-    question_seconds = 0.5
+    poll_seconds = 0.5
 
     def __init__(self, place: str) -> None:
         self.place = place
@@ -32,18 +32,18 @@ class StopSign(ABC):
         """Tell the workers to stop."""
 
     def is_set(self) -> bool:
-        """Return whether to stop; may be asked often."""
-        if not self._answer and time.monotonic() >= self._asked_at + self.question_seconds:
+        """Return whether to stop; cheap, because it reads only every ``poll_seconds``."""
+        if not self._answer and time.monotonic() >= self._asked_at + self.poll_seconds:
             self._asked_at = time.monotonic()
-            self._answer = self._says_stop()
+            self._answer = self._read()
         return self._answer
 
     @abstractmethod
-    def _says_stop(self) -> bool:
-        """Look at the sign."""
+    def _read(self) -> bool:
+        """Return whether the signal is set now."""
 
 
-class StopFile(StopSign):
+class StopFile(StopSignal):
     """Stop signal in the sweep's folder.
 
     Workers continue as long as the file is empty; they stop when it has content or is missing. It exists from
@@ -79,7 +79,7 @@ class StopFile(StopSign):
         except OSError:  # no room on the disk; a missing file means stop, too
             self.path.unlink(missing_ok=True)
 
-    def _says_stop(self) -> bool:
+    def _read(self) -> bool:
         try:
             return bool(self.path.read_bytes())
         except FileNotFoundError:

@@ -85,7 +85,7 @@ _TRIAL = re.compile(r"__[0-9a-f]{10}$")
 
 
 class SweepStore:
-    """The folder of one sweep; every path in it is an attribute here, and the module says what it holds.
+    """The folder of one sweep; its paths, and what the files hold.
 
     Attributes:
         folder: ``<root>/<sweep>``.
@@ -101,6 +101,8 @@ class SweepStore:
     sync_folder = PathIn("mlflow-sync")
     stop_request_path = PathIn("stop.request")
     storage_path = PathIn("storage.json")
+    lock_path = PathIn("lock")
+    aside_folder = PathIn("aside")
 
     def __init__(self, root: Path, name: str) -> None:
         self.folder = root.absolute() / name
@@ -282,7 +284,7 @@ class SweepStore:
     def is_locked(self) -> bool:
         """Whether a process runs the sweep."""
         try:
-            with look_at_lock(self.folder / "lock") as file:
+            with look_at_lock(self.lock_path) as file:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
             return True
@@ -298,12 +300,12 @@ class SweepStore:
             SweepBusyError: another process holds it.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        for path in (self.folder / "lock", self.info_path, self.specs_path, self.grid_path):
+        for path in (self.lock_path, self.info_path, self.specs_path, self.grid_path):
             if path.is_dir():
-                move_aside(path, self.folder / "aside")
+                move_aside(path, self.aside_folder)
         if self.trials_folder.exists() and not self.trials_folder.is_dir():
-            move_aside(self.trials_folder, self.folder / "aside")
-        with open_lock(self.folder / "lock") as file:
+            move_aside(self.trials_folder, self.aside_folder)
+        with open_lock(self.lock_path) as file:
             if not _try_lock(file):
                 file.seek(0)
                 holder = file.read().strip() or "another process"

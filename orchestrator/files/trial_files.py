@@ -28,6 +28,11 @@ EVALUATION_COLUMNS = ("policy", "index", "length", "episode_return")
 HARD_LANDING, POLICY_NOISE = "hard landing", "policy noise"  # events that warnings and figures use
 
 
+def of_update(update: int) -> str:
+    """Return the beginning of the names of evaluations and videos of the policy after an update."""
+    return f"update-{update:08d}"
+
+
 class FileKind(Enum):
     """How a file is written."""
 

@@ -19,7 +19,7 @@ import pandas as pd
 from recrl.orchestrator.errors import CheckpointError, DamagedError, OtherFormatError, StorageError
 from recrl.orchestrator.files import checkpoint_format
 from recrl.orchestrator.files.atomic_files import parsed_object, read_sealed
-from recrl.orchestrator.files.row_files import Extent, digest_of, shortage
+from recrl.orchestrator.files.row_files import NO_FILE, Extent, digest_of, shortage
 from recrl.orchestrator.files.trial_files import EVALUATION_COLUMNS, TrialFiles
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.spec import TrialSpec, TrialStatus
@@ -75,36 +75,36 @@ class TrialReader(TrialFiles):
         has the status also if the trial's commits in the object store cannot be used. Then no launch runs it.
         """
         try:
-            stated, wrong = self._looked_at(self._short)
+            recorded, wrong = self._with_findings(self._short)
         except StorageError as error:
             return self._damaged(TrialRecord(), error)
-        if stated.status is TrialStatus.DAMAGED:
-            return replace(stated, claims=TrialStatus.COMPLETE)  # it must not run again
-        return self._damaged(stated, wrong) if wrong else stated
+        if recorded.status is TrialStatus.DAMAGED:
+            return replace(recorded, is_left_alone=True)
+        return self._damaged(recorded, wrong) if wrong else recorded
 
-    def _looked_at(self, look: Callable[[TrialRecord], Found]) -> tuple[TrialRecord, Found]:
-        """The record, and what is wrong with the files by it; looked at again where the record changes."""
-        stated = None
+    def _with_findings(self, check: Callable[[TrialRecord], Found]) -> tuple[TrialRecord, Found]:
+        """Return the record, and what ``check`` finds wrong; again if the record changes meanwhile."""
+        recorded = None
         for _ in range(READ_TRIES):
-            stated, before = self._stated(), stated
-            found = look(stated)
-            if not found or stated == before:
+            recorded, before = self._recorded(), recorded
+            found = check(recorded)
+            if not found or recorded == before:
                 break
-        assert stated is not None
-        return stated, found
+        assert recorded is not None
+        return recorded, found
 
-    def stated(self) -> TrialRecord:
+    def recorded(self) -> TrialRecord:
         """Read ``state.json`` without a check of other files; a blank record if it is missing.
 
         Raises:
             DamagedError: it is not what was written.
         """
         try:
-            return self._stated()
+            return self._recorded()
         except StorageError as error:
             raise type(error)(f"{self.folder.name}: {error}") from error
 
-    def _stated(self) -> TrialRecord:
+    def _recorded(self) -> TrialRecord:
         try:
             value = read_sealed(self.state_path, version=RECORD_FORMAT)
             owner = value.pop("trial_id")
@@ -136,20 +136,21 @@ class TrialReader(TrialFiles):
                 return DamagedError(f"{name} {shortage(found, length)}")
         return None
 
-    def _damaged(self, stated: TrialRecord, error: StorageError) -> TrialRecord:
+    def _damaged(self, recorded: TrialRecord, error: StorageError) -> TrialRecord:
         """Return the record of a damaged trial, with a sentence on damage and remedy."""
-        claims = stated.status if stated.attempt else None
-        if isinstance(error, OtherFormatError):
-            claims = (
-                TrialStatus.COMPLETE
-            )  # the status is unknown: the trial must not run again without a request
-        if self.is_local_copy:
+        had_ended = recorded.attempt > 0 and recorded.status in (TrialStatus.COMPLETE, TrialStatus.FAILED)
+        is_left_alone = had_ended or isinstance(error, OtherFormatError)  # its status is unknown
+        if not isinstance(error, DamagedError):
+            remedy = "try again when the disk can be read"
+        elif self.is_local_copy:
             remedy = "the sweep's folder is only a local copy: delete it, and it is fetched again"
-        elif claims in (TrialStatus.COMPLETE, TrialStatus.FAILED):
+        elif is_left_alone:
             remedy = "launch --rerun-damaged runs the trial again and moves the damaged files aside"
         else:
             remedy = "the next launch continues from the intact files and moves the damaged ones aside"
-        return replace(stated, status=TrialStatus.DAMAGED, claims=claims, error=f"{error}; {remedy}")
+        return replace(
+            recorded, status=TrialStatus.DAMAGED, is_left_alone=is_left_alone, error=f"{error}; {remedy}"
+        )
 
     def damages(self) -> list[str]:
         """Return a sentence for each file that differs from its commit, by lengths and digests.
@@ -157,7 +158,7 @@ class TrialReader(TrialFiles):
         Empty for an intact trial, and for a trial that was never started.
         """
         try:
-            return self._looked_at(lambda stated: list(self._wrong_files(stated)))[1]
+            return self._with_findings(lambda recorded: list(self._wrong_files(recorded)))[1]
         except StorageError as error:
             return [str(error)]
 
@@ -209,21 +210,22 @@ class TrialReader(TrialFiles):
 
         Raises:
             DamagedError: they differ from the commit.
+            StorageError: they cannot be read at present.
         """
-        stated: TrialRecord | None = None
+        recorded: TrialRecord | None = None
         for _ in range(READ_TRIES):
-            stated, before = self.stated(), stated
-            extent = stated.extents.get(path.name, Extent())
+            recorded, before = self.recorded(), recorded
+            extent = recorded.extents.get(path.name, Extent())
             data = _head(path, extent.length)
             if Extent.of(data) == extent:
                 return data
-            if stated == before:
+            if recorded == before:
                 break
-        assert stated is not None
-        wrong = self._short(stated) or DamagedError(
+        assert recorded is not None
+        wrong = self._short(recorded) or DamagedError(
             f"{path.name} is not what was committed: its checksum differs"
         )
-        raise DamagedError(f"{self.folder.name}: {self._damaged(stated, wrong).error}")
+        raise type(wrong)(f"{self.folder.name}: {self._damaged(recorded, wrong).error}")
 
     def episodes(self) -> pd.DataFrame:
         """Read the committed episodes: EPISODE_COLUMNS, then cost_i and limit_i for each cost.
@@ -289,11 +291,17 @@ class TrialReader(TrialFiles):
 
 
 def _head(path: Path, length: int) -> bytes:
-    """Return a file's first bytes, fewer if it is shorter."""
+    """Return a file's first bytes, fewer if it is shorter; none if it is missing.
+
+    Raises:
+        StorageError: it cannot be read.
+    """
     if length == 0:
         return b""
     try:
         with path.open("rb") as file:
             return file.read(length)
-    except OSError:
+    except NO_FILE:
         return b""
+    except OSError as error:
+        raise StorageError(f"{path.parent.name}: {path.name} cannot be read ({error.strerror})") from error

@@ -34,7 +34,7 @@ class TrialRecord:
         start_limits: the training limits d_t with which the curriculum started, measured or as given, [k],
             or None.
         error: one line with the reason of a failure or the damage, or empty.
-        claims: for a damaged trial, the status in its files, or None; not stored.
+        is_left_alone: whether a damaged trial runs again only on request; not stored.
     """
 
     status: TrialStatus = TrialStatus.WAITING
@@ -55,7 +55,7 @@ class TrialRecord:
     checkpoint: str = ""
     start_limits: list[float | str] | None = None
     error: str = ""
-    claims: TrialStatus | None = None
+    is_left_alone: bool = False
 
     @property
     def extents(self) -> dict[str, Extent]:
@@ -64,7 +64,7 @@ class TrialRecord:
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values; ``from_json`` is its inverse."""
-        return {name: value for name, value in asdict(self).items() if name != "claims"}
+        return {name: value for name, value in asdict(self).items() if name != "is_left_alone"}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> TrialRecord:

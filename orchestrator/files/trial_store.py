@@ -21,6 +21,7 @@ from recrl.orchestrator.files.atomic_files import (
     parsed_object,
     read_sealed,
     read_whole,
+    remove_temporary_files,
     write_atomically,
     write_sealed,
 )
@@ -90,6 +91,8 @@ class TrialStore(TrialReader):
             self.reserve_path.write_bytes(secrets.token_bytes(RESERVE_BYTES))
             self._set_all_aside_on_request()  # once there is room for an attempt
             self.checkpoints_folder.mkdir(exist_ok=True)
+            for folder in (self.folder, self.checkpoints_folder):
+                remove_temporary_files(folder)
             self.move_aside(self.error_path)  # the traceback of an earlier attempt
             old = self._salvaged()
             if self.spec_path.name not in old.committed:
@@ -122,7 +125,7 @@ class TrialStore(TrialReader):
         """
         rows = files_of(FileKind.ROWS)
         try:
-            old = self._stated()
+            old = self._recorded()
         except DamagedError as error:
             logger.warning("%s: %s; it is moved aside", self.folder.name, error)
             for path in (self.state_path, self.spec_path, self.evaluation_path, self.policy_path):
@@ -237,8 +240,8 @@ class TrialStore(TrialReader):
         with self.locked():
             self._set_all_aside_on_request()
             try:
-                stated = self._stated()
+                recorded = self._recorded()
             except DamagedError:
                 self.move_aside(self.state_path)
-                stated = TrialRecord(attempt=self._attempts_made())
-            self.write_record(replace(stated, status=status, error=error, token=""))
+                recorded = TrialRecord(attempt=self._attempts_made())
+            self.write_record(replace(recorded, status=status, error=error, token=""))

@@ -79,7 +79,8 @@ class TrialWriter:
             StorageError: a file cannot be read at present, so whether it is intact is not known.
         """
         with self._lease():
-            tree = self._newest_usable()
+            path, tree = self._newest_usable()
+            state = tree["trial"] if tree else {}
             if tree is None:
                 for file in self._rows:
                     file.resume_after(Extent())
@@ -88,9 +89,12 @@ class TrialWriter:
                     self.store.move_aside(file.path, copy=True)
             self._cpu_before = float(tree["cpu_seconds"]) if tree else 0.0
             self._cpu_origin = time.process_time()
-            self._write_record(
-                **as_fields(self._extents())
-            )  # before the truncation: readers must not see files that are too short
+            self._write_record(  # before the truncation: readers must not see files that are too short
+                **as_fields(self._extents()),
+                checkpoint=path.name if path else "",
+                update=state.get("update", 0),
+                env_steps=state.get("env_steps", 0),
+            )
             for file in self._rows:
                 if file.path.exists():
                     os.truncate(file.path, file.length)
@@ -106,19 +110,19 @@ class TrialWriter:
             return path.stat().st_size
         return self.record.committed.get(path.name, 0)
 
-    def _newest_usable(self) -> dict[str, Any] | None:
-        """Return the newest usable checkpoint; unusable ones are renamed."""
-        found: dict[str, Any] | None = None
+    def _newest_usable(self) -> tuple[Path | None, dict[str, Any] | None]:
+        """Return path and content of the newest usable checkpoint; unusable ones are renamed."""
+        found: tuple[Path | None, dict[str, Any] | None] = (None, None)
         for path in self.store.checkpoints():
             try:
                 tree = self.store.load_checkpoint(path)
             except CheckpointError as error:
                 logger.warning("%s; it is renamed", error)
             else:
-                if found is not None:
+                if found[0] is not None:
                     continue
                 if all(file.resume_after(_extent_in(tree, file.path.name)) for file in self._rows):
-                    found = tree
+                    found = path, tree
                     continue
                 logger.warning("%s: its rows are missing; it is renamed", path)
             damaged = path.with_suffix(".damaged")
@@ -244,7 +248,7 @@ class TrialWriter:
     @contextmanager
     def _lease(self) -> Iterator[None]:
         with self.store.writing(), self.store.locked():
-            if self.store.stated().token != self.record.token:
+            if self.store.recorded().token != self.record.token:
                 raise LostLeaseError(f"{self.store.folder.name}: another attempt runs this trial now")
             yield
 

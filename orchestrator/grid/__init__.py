@@ -1,1 +1,1 @@
-"""The grid file: its schema, its trials, and the plan for a launch."""
+"""The grid file: its schema and its trials."""

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from recrl.agents.agent import EntropyRewarded
 from recrl.agents.registry import AGENTS, make_agent
 from recrl.environments.cmdp import CMDPSpec
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
@@ -17,7 +18,7 @@ from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.problem_list import TASK_MARK
 from recrl.orchestrator.located_yaml import Place
 from recrl.orchestrator.spec import Choice, TrialSpec
-from recrl.teachers.registry import TEACHERS, make_teacher
+from recrl.teachers.registry import TEACHERS, find_teacher, make_teacher
 from recrl.teachers.teacher import check_limits_fall, checked_answer
 
 logger = logging.getLogger("recrl.sweep")
@@ -75,25 +76,45 @@ def build_own(grid: GridSpec, cmdps: Mapping[str, CMDPSpec]) -> Iterator[tuple[P
     task_labels = [cell.task.label for cell in grid.tasks]
     agent_labels = [agent.label for agent in grid.agents]
     method_labels = [method.label for method in grid.methods]
+    rewarding = {
+        (it.task.label, it.agent.label): it.method.label
+        for it in trials
+        if find_teacher(it.method.name).rewards_entropy
+    }
     failed = set()
     for task, spec in tasks.items():
         if mistake := _mistake(replace(spec, agent=PLAIN_AGENT, method=NO_CURRICULUM)):
             failed.add(task)
             yield ("tasks", task_labels.index(task)), f"{TASK_MARK} {mistake}", task
     for (task, label), spec in agents.items():
-        if mistake := _agents_mistake(spec, cmdps[task], is_rehearsed=task not in failed):
+        method = rewarding.get((task, label), "")
+        if mistake := _agents_mistake(
+            spec, cmdps[task], rewards_entropy=method, is_rehearsed=task not in failed
+        ):
             yield ("agents", agent_labels.index(label)), f"{label} {mistake}", task
     for (task, label), spec in methods.items():
         if mistake := _curriculums_mistake(spec, cmdps[task], is_rehearsed=task not in failed):
             yield ("methods", method_labels.index(label)), f"{label} {mistake}", task
 
 
-def _agents_mistake(spec: TrialSpec, cmdp: CMDPSpec, *, is_rehearsed: bool) -> str:
-    """Return what is wrong with a trial's agent, or nothing."""
+def _agents_mistake(spec: TrialSpec, cmdp: CMDPSpec, *, rewards_entropy: str, is_rehearsed: bool) -> str:
+    """Return what is wrong with a trial's agent, or nothing.
+
+    Args:
+        spec: the trial.
+        cmdp: of its task.
+        rewards_entropy: a method that the agent meets and that rewards entropy, or empty.
+        is_rehearsed: whether to train it for a few updates.
+    """
     try:
-        make_agent(spec.agent.name, cmdp, spec.agent.options, np.random.SeedSequence(0))
+        agent = make_agent(spec.agent.name, cmdp, spec.agent.options, np.random.SeedSequence(0))
     except USERS_ERRORS as error:
         return f"cannot be built on {TASK_MARK}: {described_with_place(error)}"
+    if rewards_entropy and not isinstance(agent, EntropyRewarded):
+        return (
+            f"on {TASK_MARK} cannot learn a rewarded entropy, which the method {rewards_entropy} needs; give "
+            "it the attribute learns_rewarded_entropy, use another method, or exclude the pair"
+        )
     if not is_rehearsed:
         return ""
     if mistake := _mistake(replace(spec, method=NO_CURRICULUM)):

@@ -119,7 +119,7 @@ LISTS: Mapping[str, type[BaseModel]] = {"tasks": TaskEntry, "agents": Entry, "me
 
 
 def listed(kind: Kind) -> Iterator[tuple[str, str]]:
-    """Return every known name of a kind and its summary; for names that cannot be loaded, the reason."""
+    """Yield every known name of a kind and its summary; for names that cannot be loaded, the reason."""
     for name in kind.names:
         try:
             yield name, kind.summary(name)

@@ -42,6 +42,11 @@ def _not_a_truth_value(value: Any) -> Any:
 def _read_limits(value: Any) -> tuple[float, ...]:
     """Read one number for all costs, or a list with one number per cost."""
     values = value if isinstance(value, list) else [value]
+    if isinstance(value, dict) or any(isinstance(limit, list | dict) for limit in values):
+        raise ValueError(
+            "must be a number, or a list with one number per cost in the order of the task's costs, got "
+            f"{as_written(value)}; for several limits name the task again, with another label"
+        )
     if not values:
         raise ValueError("must be a number or a list of numbers, got []")
     for limit in values:

@@ -37,45 +37,45 @@ class HangWatchdog:
         self._place = place
         self._store = place.store
         self._seconds = seconds
-        self._heard: dict[str, tuple[tuple[int, float], float]] = {}
+        self._last: dict[str, tuple[tuple[int, float], float]] = {}
         self._before: dict[str, tuple[int, float]] = {}
-        self._looked_at = float("-inf")
+        self._checked_at = float("-inf")
 
     def begin(self, trial: Any) -> None:
         """Record that a process starts one of Tune's trials."""
-        sign = _sign_of(self._store.trial(spec_of(trial)).record())
-        self._before[trial.trial_id] = sign
-        self._heard[trial.trial_id] = (sign, time.monotonic())
+        heartbeat = _heartbeat_of(self._store.trial(spec_of(trial)).record())
+        self._before[trial.trial_id] = heartbeat
+        self._last[trial.trial_id] = (heartbeat, time.monotonic())
 
     def end(self, trials: Sequence[Any]) -> None:
         """End the running trials without a heartbeat."""
         now = time.monotonic()
-        if now < self._looked_at + look_seconds(self._seconds):
+        if now < self._checked_at + look_seconds(self._seconds):
             return
-        self._looked_at = now
+        self._checked_at = now
         if self._place.is_out_of_touch(self._seconds):
-            self._heard.clear()  # this machine cannot read the heartbeats
+            self._last.clear()  # this machine cannot read the heartbeats
             return
         for trial in trials:
             if trial.status != "RUNNING":
-                self._heard.pop(trial.trial_id, None)
+                self._last.pop(trial.trial_id, None)
                 continue
             spec = spec_of(trial)
             record = self._store.trial(spec).record()
-            sign = _sign_of(record)
-            last, heard_at = self._heard.get(trial.trial_id, (None, now))
-            if sign != last:
-                self._heard[trial.trial_id] = (sign, now)
+            heartbeat = _heartbeat_of(record)
+            last, seen_at = self._last.get(trial.trial_id, (None, now))
+            if heartbeat != last:
+                self._last[trial.trial_id] = (heartbeat, now)
                 continue
-            has_spoken = sign != self._before.get(trial.trial_id)
-            patience = self._seconds * (1 if has_spoken else STARTUP_GRACE_FACTOR)
-            if now - heard_at > patience and (record.status is TrialStatus.RUNNING or not has_spoken):
-                self._heard[trial.trial_id] = (sign, float("inf"))  # once per silence
+            has_beaten = heartbeat != self._before.get(trial.trial_id)
+            patience = self._seconds * (1 if has_beaten else STARTUP_GRACE_FACTOR)
+            if now - seen_at > patience and (record.status is TrialStatus.RUNNING or not has_beaten):
+                self._last[trial.trial_id] = (heartbeat, float("inf"))  # once per silence
                 logger.warning("%s: no sign of work for %.0f seconds", spec.title, patience)
-                _end_process(record if has_spoken else None, trial.temporary_state.ray_actor)
+                _end_process(record if has_beaten else None, trial.temporary_state.ray_actor)
 
 
-def _sign_of(record: TrialRecord) -> tuple[int, float]:
+def _heartbeat_of(record: TrialRecord) -> tuple[int, float]:
     """Return the values that change with every sign of life."""
     return record.attempt, record.heartbeat
 

@@ -141,6 +141,7 @@ def _torch_without_gpu() -> str:
 
 def _look() -> Callable[[tuple[str, ...], str, str], dict[str, str]]:
     """Return the function that runs on the nodes. As a closure it is sent by value: a node may lack recrl."""
+    problem = ACCESS_PROBLEM
 
     def look(distributions: tuple[str, ...], probe: str, uri: str) -> dict[str, str]:
         import importlib  # noqa: PLC0415
@@ -162,15 +163,15 @@ def _look() -> Callable[[tuple[str, ...], str, str], dict[str, str]]:
             if uri:
                 package = importlib.import_module("recrl.orchestrator.remote.object_store")
                 seen = package.ObjectStore(uri).read(probe) is not None
-                found["what keeps it from the results"] = "" if seen else ", but another file in its place"
+                found[problem] = "" if seen else ", but another file in its place"
             else:  # a network file system may cache that a file is absent; opening it asks the server
                 with open(probe):
-                    found["what keeps it from the results"] = ""
+                    found[problem] = ""
         except OSError:
             shared = ", which must be on a file system that all nodes share"
-            found["what keeps it from the results"] = shared
+            found[problem] = shared
         except Exception as error:  # an error of a class that may be missing here
-            found["what keeps it from the results"] = f" ({error})"
+            found[problem] = f" ({error})"
         return found
 
     return look

@@ -16,9 +16,12 @@ def environment(changes: Mapping[str, str]) -> Iterator[None]:
     os.environ.update(changes)
     try:
         yield
-    finally:
-        os.environ.clear()
-        os.environ.update(before)
+    finally:  # variable by variable, because other threads read the environment
+        for name in os.environ.keys() - before.keys():
+            del os.environ[name]
+        for name, value in before.items():
+            if os.environ.get(name) != value:
+                os.environ[name] = value
 
 
 @contextmanager

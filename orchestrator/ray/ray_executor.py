@@ -38,7 +38,7 @@ from ray.tune.search import BasicVariantGenerator
 
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.files.scratch import scratch_folder
-from recrl.orchestrator.files.stop_file import StopSign
+from recrl.orchestrator.files.stop_file import StopSignal
 from recrl.orchestrator.grid.file_models import Resources
 from recrl.orchestrator.launch_plan import usable_cores
 from recrl.orchestrator.ray.clusters import QUIET, WORKER, existing_cluster, local_cluster
@@ -85,15 +85,21 @@ class RayExecutor:
         if not specs or stop.is_set():
             return
         lost = LostServices()
-        with environment(QUIET | WORKER), lost.watched(self._cluster()), place.new_stop_sign() as stop_sign:
+        with (
+            environment(QUIET | WORKER),
+            lost.watched(self._cluster()),
+            place.new_stop_signal() as stop_signal,
+        ):
             if self.address:
-                check_nodes(stop_sign.place, stop_sign.uri)
+                check_nodes(stop_signal.place, stop_signal.uri)
             if self.resources.gpus_per_trial:
                 check_gpus()
             queue = BasicVariantGenerator(max_concurrent=min(len(specs), self._slots()))
             watchdog = HangWatchdog(place, self.silence_of(place))
-            watch = DriverWatch(place, queue, stop=stop, stop_sign=stop_sign, watchdog=watchdog, lost=lost)
-            self._run_on_cluster(specs, place, stop_sign, queue, watch)
+            watch = DriverWatch(
+                place, queue, stop=stop, stop_signal=stop_signal, watchdog=watchdog, lost=lost
+            )
+            self._run_on_cluster(specs, place, stop_signal, queue, watch)
 
     def silence_of(self, place: SweepPlace) -> float:
         """Return the wall seconds without a heartbeat after which a trial of a place counts as hanging."""
@@ -110,7 +116,7 @@ class RayExecutor:
         self,
         specs: Sequence[TrialSpec],
         place: SweepPlace,
-        stop_sign: StopSign,
+        stop_signal: StopSignal,
         queue: BasicVariantGenerator,
         watch: DriverWatch,
     ) -> None:
@@ -120,7 +126,7 @@ class RayExecutor:
             "spec": tune.grid_search([json.dumps(spec.to_json()) for spec in specs]),
             "sweep": str(place.store.folder),
             "storage": place.uri,
-            "stop_sign": stop_sign.place,
+            "stop_signal": stop_signal.place,
             "teacher_service": service_name,
             "commit_seconds": self.commit_seconds,
         }

@@ -1,7 +1,6 @@
 """One teacher for a whole sweep: a stateless Ray actor, and its proxy in the trials.
 
-A teacher is a pure function, so a restart of the actor or a repeated call affects no trial. It is separate
-from ``executor``, because workers import this module and not Tune.
+A teacher is a pure function, so a restart of the actor or a repeated call affects no trial.
 """
 
 from __future__ import annotations

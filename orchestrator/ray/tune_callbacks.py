@@ -21,7 +21,7 @@ from ray.exceptions import (
 from ray.tune.search import BasicVariantGenerator
 
 from recrl.orchestrator.errors import StorageError, TeacherUnavailableError, first_line
-from recrl.orchestrator.files.stop_file import StopSign
+from recrl.orchestrator.files.stop_file import StopSignal
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
 from recrl.orchestrator.ray.services import LostServices
 from recrl.orchestrator.ray.tune_trial import spec_of
@@ -44,14 +44,14 @@ class DriverWatch(tune.Callback):
         queue: BasicVariantGenerator,
         *,
         stop: threading.Event,
-        stop_sign: StopSign,
+        stop_signal: StopSignal,
         watchdog: HangWatchdog,
         lost: LostServices,
     ) -> None:
         self._place = place
         self._queue = queue
         self._stop = stop
-        self._stop_sign = stop_sign
+        self._stop_signal = stop_signal
         self._watchdog = watchdog
         self._lost = lost
         self._last_event = time.monotonic()
@@ -69,7 +69,7 @@ class DriverWatch(tune.Callback):
         if self._stop.is_set():
             if not self._queue.is_finished():
                 self._queue.set_finished()  # type: ignore[no-untyped-call]
-            self._stop_sign.set()
+            self._stop_signal.set()
             self.stopped_and_idle = all(trial.status != "RUNNING" for trial in trials)
 
     def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:

@@ -49,13 +49,13 @@ class TuneTrial(tune.Trainable):
         """
         from recrl.orchestrator.trial.attempt import run_recorded  # noqa: PLC0415  (imports torch; the driver does without)
 
-        if not self._stop_sign.is_set():
+        if not self._stop_signal.is_set():
             try:
-                with self._place.working_copy(self._spec, self._stop_sign.is_set) as trial:
+                with self._place.working_copy(self._spec, self._stop_signal.is_set) as trial:
                     run_recorded(
                         self._spec,
                         trial,
-                        should_stop=self._stop_sign.is_set,
+                        should_stop=self._stop_signal.is_set,
                         teacher=self._teacher,
                         commit_seconds=self._commit_seconds,
                         on_gpu=bool(ray.get_gpu_ids()),
@@ -68,7 +68,7 @@ class TuneTrial(tune.Trainable):
         self._spec = TrialSpec.from_json(json.loads(config["spec"]))
         sweep = Path(config["sweep"])
         self._place = sweep_place(SweepStore(sweep.parent, sweep.name), config["storage"])
-        self._stop_sign = self._place.stop_sign_at(config["stop_sign"])
+        self._stop_signal = self._place.stop_signal_at(config["stop_signal"])
         self._commit_seconds: float = config["commit_seconds"]
         name = config["teacher_service"]
         self._teacher = RayTeacher(self._spec.teacher, find_teacher_service(name)) if name else None

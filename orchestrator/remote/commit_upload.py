@@ -53,7 +53,7 @@ class Upload:
         """
         self._remote = remote
         self._trial = trial
-        self._before = trial.stated().token
+        self._before = trial.recorded().token
         self._started_from = pulled_key(trial)
         self._commits: list[tuple[str, Commit]] = []
         self._written: set[str] = set()
@@ -87,7 +87,7 @@ class Upload:
 
     def _own_record(self) -> TrialRecord | None:
         """Return the record of the attempt to upload; None before it has begun."""
-        record = self._trial.stated()
+        record = self._trial.recorded()
         return None if record.token in ("", self._before) else record
 
     def push(self) -> None:
@@ -130,13 +130,13 @@ class Upload:
         self._heartbeat_sent = time.monotonic()
 
     def _capture(self) -> tuple[TrialRecord, dict[str, tuple[Piece, ...]], dict[str, tuple[int, bytes]]]:
-        """Return the record, the sent pieces and the new bytes; the caller holds the trial's lock.
+        """Return the record, the sent pieces and the new bytes; holds the trial's lock.
 
         The rows are those of the newest checkpoint: if a full disk interrupted a commit, the record may be
         older.
         """
         with self._trial.locked():
-            record = self._trial.stated()
+            record = self._trial.recorded()
             saved, rows = _newest_checkpoint(self._trial)
             extents = {**record.extents, **dict.fromkeys(files_of(FileKind.ROWS), Extent()), **rows}
             committed = {name: extent.length for name, extent in extents.items()}

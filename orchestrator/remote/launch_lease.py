@@ -130,19 +130,19 @@ class LaunchLease:
 
     def _hold(self, own: dict[str, Any], stop: threading.Event, over: threading.Event) -> None:
         """Write signs of life, and check for requests."""
-        spoke_at = time.monotonic()
+        renewed_at = time.monotonic()
         while not over.wait(LEASE_CHECK_SECONDS):
             try:
                 if self._objects.read(STOP_REQUEST) is not None:
                     stop.set()
-                if time.monotonic() >= spoke_at + BEAT_SECONDS:
+                if time.monotonic() >= renewed_at + BEAT_SECONDS:
                     holder = self._holder()
                     if holder and holder.get("token") != own["token"]:
                         logger.warning("%s: another launch has taken over the sweep", self._objects.uri)
                         stop.set()
                         return
                     self._objects.write(LAUNCH, _beat(own))
-                    spoke_at = time.monotonic()
+                    renewed_at = time.monotonic()
             except StorageError as error:  # pulling reports the error
                 logger.debug("%s", error)
 

@@ -29,7 +29,7 @@ from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.errors import DamagedError, RecrlError, StorageError
 from recrl.orchestrator.files.atomic_files import read_sealed, write_atomically, write_sealed
 from recrl.orchestrator.files.locks import locked
-from recrl.orchestrator.files.stop_file import StopSign
+from recrl.orchestrator.files.stop_file import StopSignal
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.remote.commit_upload import ALIVE_SECONDS, working_copy
@@ -161,11 +161,11 @@ class RemoteSweep(SweepPlace):
         """See ``SweepPlace`` and ``commit_upload.working_copy``."""
         return working_copy(self.trial(spec.folder_name), spec, should_stop)
 
-    def new_stop_sign(self) -> AbstractContextManager[StopSign]:
+    def new_stop_signal(self) -> AbstractContextManager[StopSignal]:
         """Return the stop signal of a new run; see ``StopObject.open``."""
         return StopObject.open(self.objects)
 
-    def stop_sign_at(self, place: str) -> StopSign:
+    def stop_signal_at(self, place: str) -> StopSignal:
         """See ``SweepPlace``."""
         return StopObject(self.objects, place)
 

@@ -8,16 +8,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from recrl.orchestrator.errors import StorageError
-from recrl.orchestrator.files.stop_file import StopSign
+from recrl.orchestrator.files.stop_file import StopSignal
 from recrl.orchestrator.remote.object_store import ObjectStore
 
 logger = logging.getLogger("recrl.sweep")
 
 
-class StopObject(StopSign):
+class StopObject(StopSignal):
     """Stop signal in the object store; its place is the object's key, relative to the sweep's address."""
 
-    question_seconds = 5.0
+    poll_seconds = 5.0
 
     def __init__(self, objects: ObjectStore, key: str) -> None:
         super().__init__(key)
@@ -33,13 +33,13 @@ class StopObject(StopSign):
             StorageError: the store cannot be written.
         """
         objects.delete(key for key in objects.names("file") if key.startswith("stop-"))
-        sign = cls(objects, f"stop-{secrets.token_hex(4)}")
-        objects.write(sign.place, b"go on\n")
+        signal = cls(objects, f"stop-{secrets.token_hex(4)}")
+        objects.write(signal.place, b"go on\n")
         try:
-            yield sign
+            yield signal
         finally:
             try:
-                objects.delete([sign.place])
+                objects.delete([signal.place])
             except StorageError as error:
                 logger.warning("%s", error)
 
@@ -53,7 +53,7 @@ class StopObject(StopSign):
         except StorageError as error:
             logger.debug("%s", error)
 
-    def _says_stop(self) -> bool:
+    def _read(self) -> bool:
         """Read the object; no answer means no."""
         try:
             return self._objects.read(self.place) != b"go on\n"

@@ -21,7 +21,7 @@ from recrl.orchestrator.redaction import RedactedStream
 from recrl.orchestrator.sweep_progress import DisplayStatus, display_status
 from recrl.orchestrator.tracking.client import MLFLOW_SETTINGS, one_line
 from recrl.orchestrator.tracking.export_file import write_in_own_process
-from recrl.orchestrator.tracking.mlflow_sync import SyncReport, Tracker
+from recrl.orchestrator.tracking.mlflow_sync import SyncReport, Tracker, without_export
 from recrl.orchestrator.tracking.positions import sync_folder
 
 POLITENESS = 10  # added to the process's nice value: about a tenth of a core next to a trial
@@ -93,23 +93,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     store = SweepStore(arguments.folder.parent, arguments.folder.name)
     tracker = Tracker(store, os.environ["MLFLOW_TRACKING_URI"], write_in_own_process)
     wait = 0.0  # a launch with nothing to do is already over: one pass is enough
+    before = SyncReport()
     while not _is_over(arguments.parent, wait):
-        report = _pass(tracker, live=True)
+        report = _pass(tracker, before, live=True)
         longer = min(2 * max(wait, arguments.interval), LONGEST_WAIT_SECONDS)
-        wait = longer if report.problem else arguments.interval
+        wait, before = longer if report.is_broken_off else arguments.interval, report
     end = time.monotonic() + ORPHAN_SECONDS
     while _any_runs(store) and time.monotonic() < end:
         time.sleep(0.5)
-    return 0 if _pass(tracker, live=False).is_up_to_date else 1
+    return 0 if _pass(tracker, before, live=False).is_up_to_date else 1
 
 
-def _pass(tracker: Tracker, *, live: bool) -> SyncReport:
+def _pass(tracker: Tracker, before: SyncReport, *, live: bool) -> SyncReport:
+    """Make a pass, and log what is new since the one before."""
     try:
         report = tracker.bring_up_to_date(live=live)
     except OSError as error:  # a full disk, for example: the next pass may succeed
-        report = SyncReport(problem=one_line(error))
-    if report.problem:
+        report = SyncReport(problem=one_line(error), is_broken_off=True)
+    if report.problem and (report.is_broken_off or report.problem != before.problem):
         print(f"{time.strftime('%F %T')} {report.problem}", flush=True)
+    if report.remark and report.remark != before.remark:
+        print(f"{time.strftime('%F %T')} {without_export(report.remark)}", flush=True)
     return report
 
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from recrl.orchestrator.tracking.run_content import GROUP_TAG
+
 VIEW = "recrl"  # key of the view
 SECTIONS = ("final", "train", "curriculum", "deploy", "summary", "evaluation", "agent", "perf")
 OVER_STEPS = ("deploy", "train")  # sections with cost_i and limit_i over environment steps, in sorted order
@@ -36,7 +38,7 @@ def _view(num_costs: int) -> dict[str, Any]:
     return {
         "groupBy": {
             "aggregateFunction": "average",
-            "groupByKeys": [{"mode": "tag", "groupByData": "recrl.group"}],
+            "groupByKeys": [{"mode": "tag", "groupByData": GROUP_TAG}],
         },
         "runsHiddenMode": "SHOW_ALL",
         "selectedColumns": [

@@ -41,7 +41,7 @@ def downloaded_export(uri: str, name: str | None) -> Iterator[Download]:
     """Fetch the export file of the newest sweep of a name to a folder that exists during the context.
 
     Args:
-        uri: of ``address.checked_uri``.
+        uri: of ``client.checked_uri``.
         name: of the sweep; None if there is only one.
 
     Raises:

@@ -107,13 +107,13 @@ class SweepRuns:
 
         # client.log_artifact would first request the whole run, to find this location
         repository: Any = get_artifact_repository(self._artifacts[position.run_id], self._uri)
-        sent = list(position.artifacts)
+        sent = dict(position.artifacts)
         for path in paths:
             with suppress(FileNotFoundError):
-                mark = file_mark(path)
-                if mark not in sent and path.stat().st_size and path.is_file():
+                place, mark = f"{folder or '.'}/{path.name}", file_mark(path)
+                if sent.get(place) != mark and path.stat().st_size and path.is_file():
                     repository.log_artifact(str(path), folder)
-                    sent.append(mark)
+                    sent[place] = mark
         return replace(position, artifacts=sent)
 
     def _find_experiment(self) -> str:

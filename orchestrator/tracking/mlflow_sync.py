@@ -11,7 +11,7 @@ content is in ``run_content``. States of runs:
     running                                                     RUNNING
     running, but its process is gone, or silent for too long    KILLED
     complete                                                    FINISHED
-    failed                                                      FAILED, with the tag ``recrl.error``
+    failed, or damaged                                          FAILED, with the tag ``recrl.error``
 
 ``positions`` and ``trial_sync`` explain why no point is lost or duplicated. To get the data back, read the
 export file (``export_download``): MLflow's points are only for its charts.
@@ -24,7 +24,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 
-from recrl.orchestrator.errors import DamagedError
+from recrl.orchestrator.errors import DamagedError, StorageError
 from recrl.orchestrator.files.atomic_files import write_json
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
@@ -48,6 +48,7 @@ class SyncReport:
         behind: begun trials that are not up to date in MLflow.
         points: points sent.
         problem: one line on why MLflow is not up to date, or empty.
+        is_broken_off: whether the problem is of MLflow or of the pass, and not of a trial's files.
         remark: one line on why the export file could not be uploaded, or empty.
         experiment_id: the sweep's experiment, or empty if MLflow could not be reached.
     """
@@ -56,6 +57,7 @@ class SyncReport:
     behind: int = 0
     points: int = 0
     problem: str = ""
+    is_broken_off: bool = False
     remark: str = ""
     experiment_id: str = ""
 
@@ -91,6 +93,11 @@ def last_report(store: SweepStore, uri: str) -> SyncReport | None:
         return None
 
 
+def without_export(remark: str) -> str:
+    """Return the sentence on an export file that could not be uploaded."""
+    return f"without the export file ({remark}): MLflow still has the previous one"
+
+
 class Tracker:
     """State of one process between its passes over a sweep."""
 
@@ -110,6 +117,7 @@ class Tracker:
         trials = [trial for trial in self.store.trials() if _has_begun(trial.record())]
         points: list[int] = []  # of each trial that is shown
         problems: list[str] = []
+        unreadable: list[str] = []  # trials whose files are damaged
         remark = ""
         with exclusive(self.store, self.uri):
             view, self._view = self._view, None  # made anew after any error
@@ -118,7 +126,7 @@ class Tracker:
                 listed, silence = self._listed(), self.store.silence_seconds
                 for trial in trials:
                     known = listed is None or trial.folder.name in listed
-                    with _kept(problems, trial):
+                    with _kept(problems, unreadable, trial):
                         sent = view.trials.show(trial, live=live, is_in_grid=known, silence_seconds=silence)
                         points.append(sent)
                 remark = view.sweep.show(live=live)
@@ -128,7 +136,8 @@ class Tracker:
                 trials=len(trials),
                 behind=len(trials) - len(points),
                 points=sum(points),
-                problem=problems[0] if problems else "",
+                problem=next(iter([*problems, *unreadable]), ""),
+                is_broken_off=bool(problems),
                 remark=remark,
                 experiment_id=view.runs.experiment_id if view else "",
             )
@@ -161,10 +170,12 @@ class _View:
 
 
 @contextmanager
-def _kept(problems: list[str], trial: TrialStore) -> Iterator[None]:
-    """Record why MLflow refuses a trial; this does not stop the others."""
+def _kept(problems: list[str], unreadable: list[str], trial: TrialStore) -> Iterator[None]:
+    """Record why a trial cannot be shown; this does not stop the others."""
     try:
         yield
+    except StorageError as error:
+        unreadable.append(one_line(error))
     except Exception as error:
         if is_away(error):
             raise

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -29,7 +29,7 @@ class Position:
         offset: in ``updates.csv``, after the last row sent.
         last_row: that row; if the file differs, it was truncated and written again.
         shown: content of the run besides points: status, attempt, error and so on.
-        artifacts: name, size and time of the files sent.
+        artifacts: ``file_mark`` of each file sent, by its place among the run's artifacts.
         summary: the final means of a complete trial.
     """
 
@@ -37,7 +37,7 @@ class Position:
     offset: int = 0
     last_row: str = ""
     shown: Mapping[str, Any] = field(default_factory=dict)
-    artifacts: Sequence[str] = ()
+    artifacts: Mapping[str, str] = field(default_factory=dict)
     summary: Mapping[str, float] = field(default_factory=dict)
 
     def fits(self, data: bytes) -> bool:
@@ -55,7 +55,7 @@ def read_position(path: Path) -> Position | None:
         position = Position(**json.loads(path.read_text()))
     except (OSError, ValueError, TypeError):
         return None
-    kinds = (str, int, str, dict, list, dict)
+    kinds = (str, int, str, dict, dict, dict)
     values = (getattr(position, name) for name in Position.__dataclass_fields__)
     return position if all(map(isinstance, values, kinds)) else None
 

@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recrl.orchestrator.errors import DamagedError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
@@ -58,11 +57,12 @@ class TrialSync:
             silence_seconds: of ``SweepStore.silence_seconds``.
 
         Raises:
-            DamagedError: a file of the trial differs from its commit.
+            StorageError: a file of the trial differs from its commit, or cannot be read.
         """
         record = trial.record()
         if record.status is TrialStatus.DAMAGED:
-            raise DamagedError(record.error)
+            self._show_damaged(trial, record)
+            return 0
         outcome = self._outcomes.of(trial.spec, record)
         status = trial_run_status(record, live=live, silence_seconds=silence_seconds)
         shown = _shown(trial, record, outcome, status=status, is_in_grid=is_in_grid)
@@ -81,6 +81,18 @@ class TrialSync:
             self._runs.set_status(position.run_id, shown["status"], record.heartbeat)
         self._save(trial, replace(position, shown=shown))
         return len(new_points)
+
+    def _show_damaged(self, trial: TrialStore, record: TrialRecord) -> None:
+        """Give the run of a damaged trial its state and the error; its points stay as they are."""
+        from mlflow.entities import RunTag  # noqa: PLC0415
+
+        position = self._position(trial, record)
+        shown = {"status": "FAILED", "attempt": record.attempt, "error": record.error}
+        if position.shown != shown:
+            tags = [RunTag(key, value) for key, value in state_tags(record).items()]
+            self._runs.client.log_batch(position.run_id, tags=tags)
+            self._runs.set_status(position.run_id, "FAILED", record.heartbeat or time.time())
+            self._save(trial, replace(position, shown=shown))
 
     def summary(self, trial: TrialStore) -> Summary | None:
         """Return the final means of a complete trial, None before its end."""
@@ -206,6 +218,6 @@ def _result_files(trial: TrialStore, record: TrialRecord) -> list[Path]:
 
 
 def _added_afterwards(trial: TrialStore) -> list[Path]:
-    """Return evaluations and videos of the final policy, for artifacts in folders of these names."""
+    """Return evaluations and videos made by ``evaluate``, for artifacts in folders of these names."""
     folders = (trial.evaluations_folder, trial.videos_folder)
     return [path for folder in folders for path in sorted(folder.glob("update-*"))]

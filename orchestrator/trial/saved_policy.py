@@ -26,9 +26,10 @@ from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CMDPSpec
 from recrl.environments.plugins import UntrustedNameError
 from recrl.environments.registry import NotDrawnError, make_drawn
-from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
+from recrl.orchestrator.errors import TRUST_HINT, USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.files.atomic_files import write_atomically
 from recrl.orchestrator.files.row_files import rows_text
+from recrl.orchestrator.files.trial_files import of_update
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.trial import TrialSeeds, evaluation_rows, open_environments
@@ -84,7 +85,7 @@ class SavedTrial:
             agent.load_state_dict(tree["agent"])
             return cls(store, spec, final_policy(agent), cmdp, tree["update"], tree["env_steps"])
         except UntrustedNameError as error:
-            raise RecrlError(f"{spec.title}: {error}; if you trust it, add --trust") from error
+            raise RecrlError(f"{spec.title}: {error}; {TRUST_HINT}") from error
         except USERS_ERRORS as error:
             raise RecrlError(
                 f"{spec.title}: its checkpoint cannot be used with the installed task and agent: "
@@ -164,7 +165,7 @@ class SavedTrial:
         return self.store.videos_folder / f"{self._file_name(seed)}__{policy}.{video_format}"
 
     def _file_name(self, seed: int | None) -> str:
-        return f"update-{self.update:08d}__seed-{'own' if seed is None else seed}"
+        return f"{of_update(self.update)}__seed-{'own' if seed is None else seed}"
 
     def _caption(self, shot: Shot) -> str:
         costs = ", ".join(

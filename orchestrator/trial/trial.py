@@ -242,11 +242,6 @@ class Trial:
             flat = observations.reshape(-1, observations.shape[-1])
             done = checked_noise(self.spec.agent.label, self._agent.add_noise(self._step.policy_noise, flat))
             self._event(POLICY_NOISE, policy_noise=self._step.policy_noise, **done)
-        if self._step.rewards_entropy and not isinstance(self._agent, EntropyRewarded):
-            raise TypeError(
-                f"method {self.spec.method.name} rewards entropy, which agent {self.spec.agent.name} does "
-                "not support; choose another of the two"
-            )
 
     def _checked(self, answer: object, *, before: CostLimits | None) -> tuple[CurriculumStep, TeacherState]:
         """Check the curriculum's answer; ``before`` has the limits before it, None at the start."""
@@ -256,6 +251,11 @@ class Trial:
             raise TypeError(
                 f"curriculum {label}: a step has an entropy_coefficient, so its TeacherKind must have "
                 "rewards_entropy=True"
+            )
+        if step.rewards_entropy and not isinstance(self._agent, EntropyRewarded):
+            raise TypeError(
+                f"method {self.spec.method.name} rewards entropy, which agent {self.spec.agent.name} does "
+                "not support; choose another of the two"
             )
         check_limits_fall(
             step,

@@ -309,6 +309,19 @@ def test_memory_is_flat_in_the_length_of_a_run(agent: str, options: dict[str, An
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("activation", ["relu", "gelu"])
+def test_networks_with_any_activation_begin_equal_on_a_gpu(activation: str) -> None:
+    options = {"activation": activation}
+    on_cpu = Lessons("ppo-lag", "two-state", options)
+    with torch.device("cuda"):
+        on_gpu = Lessons("ppo-lag", "two-state", options)
+        on_gpu.update()
+    with torch.device("cuda"):
+        fresh = Lessons("ppo-lag", "two-state", options)
+    np.testing.assert_array_equal(fresh.agent.state_dict()["policy"], on_cpu.agent.state_dict()["policy"])
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @every_agent
 @every_task
 def test_an_agent_on_a_gpu_learns_what_one_on_a_cpu_learns(agent: str, task: str) -> None:

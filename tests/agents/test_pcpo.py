@@ -228,12 +228,17 @@ def test_a_limit_beyond_the_reach_of_crpos_step_does_not_shorten_it() -> None:
 def test_crpo_rests_where_nothing_can_be_changed() -> None:
     nothing = StepProblem(0.0, np.zeros(1), np.zeros((1, 1)), np.array([0.1]), 0.5)
     assert reward_step(nothing, CRPOConfig()).gradient_weight == 0.0
-    assert cost_step(nothing, 0, CRPOConfig()).constraint_weights.tolist() == [0.0]
 
 
 def test_crpo_mends_what_is_most_violated_in_its_own_spread() -> None:
-    ones = np.ones(3)
-    assert most_violated(np.array([-1.0, 0.0, -math.inf]), ones, 0.0) is None
-    assert most_violated(np.array([0.4, 0.2, -math.inf]), ones, 0.5) is None
-    assert most_violated(np.array([1.0, 2.0, -math.inf]), ones, 0.5) == 1
-    assert most_violated(np.array([1.0, 2.0, -math.inf]), np.array([1.0, 4.0, 1.0]), 0.5) == 0
+    ones, all_ = np.ones(3), np.full(3, True)
+    assert most_violated(np.array([-1.0, 0.0, -math.inf]), ones, 0.0, all_) is None
+    assert most_violated(np.array([0.4, 0.2, -math.inf]), ones, 0.5, all_) is None
+    assert most_violated(np.array([1.0, 2.0, -math.inf]), ones, 0.5, all_) == 1
+    assert most_violated(np.array([1.0, 2.0, -math.inf]), np.array([1.0, 4.0, 1.0]), 0.5, all_) == 0
+
+
+def test_crpo_passes_over_a_violated_cost_that_no_step_can_change() -> None:
+    gaps, ones = np.array([9.0, 2.0, -math.inf]), np.ones(3)
+    assert most_violated(gaps, ones, 0.5, np.array([False, True, True])) == 1
+    assert most_violated(gaps, ones, 0.5, np.array([False, False, True])) is None

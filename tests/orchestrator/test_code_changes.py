@@ -225,7 +225,7 @@ def test_a_rerun_whose_process_dies_before_it_begins_has_failed(folder: Path) ->
     class Dying:
         def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
             lost = SimpleNamespace(any_is_gone=lambda: False)
-            watch = DriverWatch(place, None, stop=stop, stop_sign=None, watchdog=None, lost=lost)  # type: ignore[arg-type]
+            watch = DriverWatch(place, None, stop=stop, stop_signal=None, watchdog=None, lost=lost)  # type: ignore[arg-type]
             config = {"spec": json.dumps(specs[0].to_json())}
             watch.on_trial_error(
                 0, [], SimpleNamespace(config=config, num_failures=4, pickled_error_file=None)

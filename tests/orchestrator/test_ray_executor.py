@@ -409,7 +409,7 @@ def test_a_trial_that_ends_is_seen_within_a_hundredth_of_its_time_and_half_a_sec
     assert LONGEST_PAUSE_SECONDS == 0.5
 
 
-def test_a_process_is_silent_only_after_it_has_spoken_of_its_trial(tmp_path: Path) -> None:
+def test_a_process_is_silent_only_after_its_first_heartbeat(tmp_path: Path) -> None:
     store = SweepStore(tmp_path, "sweep")
     files = store.trial(LONG)
     tune_trial = SimpleNamespace(

@@ -121,6 +121,13 @@ class Listed(NoNoise):
         self.agent.load_state_dict(state[0])
 
 
+class NoEntropy(Wrapped):
+    def __getattr__(self, name):
+        if name == "learns_rewarded_entropy":
+            raise AttributeError(name)
+        return getattr(self.agent, name)
+
+
 class Reordered(NoMode):
     """Right, but the keys of its state change places."""
 
@@ -147,6 +154,7 @@ def entry(kind):
 COUNTER, INFINITE, ODD_NAME, NO_RESTORE = map(entry, (Wrapped, Infinite, OddName, NoRestore))
 SILENT, LIMITED, NO_MODE = map(entry, (Silent, Limited, NoMode))
 NO_NOISE, LISTED, REORDERED, ODD_NOISE = map(entry, (NoNoise, Listed, Reordered, OddNoise))
+NO_ENTROPY = entry(NoEntropy)
 FALLING = entry(Falling)
 
 
@@ -275,6 +283,15 @@ def test_an_agent(agent: str, sentence: str) -> None:
     (problem,) = problems(agents=[f"own_rehearsed:{agent}"])
     assert problem.startswith(f"grid.yaml:3: agents.0: own_rehearsed:{agent} on two-state ")
     assert sentence in problem
+
+
+def test_an_agent_that_meets_a_curriculum_which_rewards_entropy() -> None:
+    (problem,) = problems(agents=["own_rehearsed:NO_ENTROPY"], methods=["none", "cooling"])
+    assert problem == (
+        "grid.yaml:3: agents.0: own_rehearsed:NO_ENTROPY on two-state cannot learn a rewarded entropy, which "
+        "the method cooling needs; give it the attribute learns_rewarded_entropy, use another method, or "
+        "exclude the pair"
+    )
 
 
 @pytest.mark.parametrize(

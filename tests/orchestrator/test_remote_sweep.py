@@ -396,7 +396,7 @@ def test_workers_hear_of_the_end_of_their_own_run_and_of_all_earlier_ones(
             assert not sign.is_set()
             sign.set()
             assert not worker.is_set()  # it asked a moment ago
-            monkeypatch.setattr(StopObject, "question_seconds", 0.0)
+            monkeypatch.setattr(StopObject, "poll_seconds", 0.0)
             assert worker.is_set()
     assert objects.keys_in() == []
 

@@ -77,6 +77,9 @@ def test_damaged_checkpoint_falls_back_to_the_one_before(store: TrialStore) -> N
     np.testing.assert_equal(writer.restore(), tree(2))
     assert store.episodes()["index"].tolist() == [1, 2]
     assert newest.with_suffix(".damaged").exists()
+    assert store.damages() == []
+    assert store.record().checkpoint == store.checkpoints()[0].name
+    assert (store.record().update, store.record().env_steps) == (2, 20)
 
 
 @pytest.mark.parametrize("code", [errno.EIO, errno.EMFILE, errno.ESTALE, errno.EACCES])
@@ -99,6 +102,10 @@ def test_what_cannot_be_read_for_a_moment_is_not_taken_for_damaged(
         with pytest.raises(StorageError, match=re.escape(f"cannot be read ({os.strerror(code)})")):
             store.begin(SPEC).restore()
         assert any(f"cannot be read ({os.strerror(code)})" in found for found in store.damages())
+        if pattern == "*.csv":
+            with pytest.raises(StorageError, match=re.escape(os.strerror(code))) as found:
+                store.episodes()
+            assert not isinstance(found.value, DamagedError)
     assert {path: path.read_bytes() for path in before} == before
     np.testing.assert_equal(store.begin(SPEC).restore(), tree(2))
 
@@ -121,6 +128,19 @@ def test_without_an_intact_checkpoint_the_trial_starts_afresh(store: TrialStore)
     writer = store.begin(SPEC)
     assert writer.restore() is None
     assert store.episodes().empty
+
+
+def test_what_a_killed_process_was_writing_is_removed(store: TrialStore) -> None:
+    work(store.begin(SPEC), 1)
+    left = [
+        store.folder / ".state.json.4711.0123abcd",
+        store.checkpoints_folder / ".checkpoint-00000002.recrl.4711.89abcdef",
+    ]
+    kept = store.folder / ".nfs.notes"
+    for path in (*left, kept):
+        path.write_bytes(b"half")
+    store.begin(SPEC)
+    assert [path.exists() for path in (*left, kept)] == [False, False, True]
 
 
 def test_two_checkpoints_are_kept(store: TrialStore) -> None:
