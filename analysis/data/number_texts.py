@@ -5,19 +5,26 @@ from __future__ import annotations
 import math
 
 DASH = "–"
+ROUNDING = 1e-9  # a smaller size counts as 0
 
 
 def number(value: float) -> str:
     """Format a value with suitable digits; a dash for NaN.
 
+    Below 0.01 these are two significant digits. A zero has no minus.
+
     >>> [number(value) for value in (9.5, 128.44, 0.0312, 0.0, float("nan"))]
     ['9.50', '128.4', '0.031', '0.00', '–']
+    >>> [number(value) for value in (0.00042, -0.002, 1.3e-5, -0.0, -1e-13)]
+    ['0.00042', '-0.002', '1.3e-05', '0.00', '0.00']
     """
     if math.isnan(value):
         return DASH
     size = abs(value)
-    digits = 1 if size >= 100.0 else 3 if 0.0 < size < 0.1 else 2
-    return f"{value:.{digits}f}"
+    if ROUNDING <= size < 0.01:
+        return f"{value:.2g}"
+    digits = 1 if size >= 100.0 else 3 if 0.01 <= size < 0.1 else 2
+    return f"{value:z.{digits}f}"  # z: no -0.00
 
 
 def with_error(mean: float, error: float, *, digits: int = 2) -> str:
@@ -36,5 +43,5 @@ def with_error(mean: float, error: float, *, digits: int = 2) -> str:
     if math.isnan(mean):
         return DASH
     shown = 1 if abs(mean) >= 100.0 else digits
-    value = round(mean, shown) + 0.0  # no -0.00
-    return f"{value:.{shown}f}" if math.isnan(error) else f"{value:.{shown}f} ± {error:.{shown}f}"
+    text = f"{mean:z.{shown}f}"  # z: no -0.00
+    return text if math.isnan(error) else f"{text} ± {error:.{shown}f}"

@@ -52,7 +52,7 @@ from recrl.analysis.data.optima import NO_OPTIMUM, UNKNOWN_OPTIMUM, optima_of
 from recrl.analysis.data.phase_totals import phase_totals
 from recrl.environments.cmdp import Phase
 from recrl.environments.finite.finite_cmdp import FiniteCMDP
-from recrl.orchestrator.errors import DamagedError, RecrlError
+from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import EPISODE_COLUMNS, EVALUATION_COLUMNS, UPDATE_COLUMNS
 from recrl.orchestrator.files.trial_reader import TrialReader
@@ -259,7 +259,7 @@ def load_episodes(
     def rows(trial: TrialReader) -> pd.DataFrame:
         try:
             episodes = trial.episodes()
-        except DamagedError as error:
+        except StorageError as error:
             logger.warning("%s; its episodes are left out", error)
             return pd.DataFrame()
         if phase is not None and len(episodes):
@@ -402,7 +402,7 @@ def _read(spec: TrialSpec, trial: TrialReader) -> tuple[TrialFacts, dict[str, pd
                 provenance=trial.committed_bytes(trial.provenance_path).decode(),
             )
             return facts, rows
-        except DamagedError as error:
+        except StorageError as error:
             record = replace(record, error=str(error).removeprefix(f"{trial.folder.name}: "))
     damaged = TrialFacts(spec=spec, status=TrialStatus.DAMAGED, error=record.error)
     return damaged, {name: pd.DataFrame() for name in ROWS}

@@ -172,9 +172,9 @@ def verdict_table(frame: pd.DataFrame, kinds: Sequence[str]) -> str:
 
     Args:
         frame: finished text, with a column ``verdict``.
-        kinds: the class of each row.
+        kinds: the class of each row, with spaces as hyphens.
     """
-    return _table(frame, [f' class="{kind}"' for kind in kinds], ' class="verdicts"')
+    return _table(frame, [f' class="{kind.replace(" ", "-")}"' for kind in kinds], ' class="verdicts"')
 
 
 def _table(frame: pd.DataFrame, of_rows: Sequence[str], of_table: str) -> str:

@@ -13,10 +13,13 @@ import pandas as pd
 from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import attempts, doubts
-from recrl.analysis.report import html_page, table_formats, verdict_texts
+from recrl.analysis.report import html_page, table_formats
 from recrl.analysis.report.figure_list import SKETCHED, Drawing, without_episodes
 from recrl.analysis.report.html_page import Section
 from recrl.analysis.report.table_files import Tables
+from recrl.analysis.report.verdict_answers import answers, no_verdict
+from recrl.analysis.report.verdict_table import verdict_kinds, verdict_table
+from recrl.analysis.report.verdict_terms import explanation, task_sentences
 from recrl.analysis.statistics.intervals import ENOUGH_RUNS
 from recrl.orchestrator.files.outcomes_file import FAILED, INFEASIBLE
 from recrl.orchestrator.spec import TrialStatus
@@ -94,13 +97,13 @@ def _made(sweep: Sweep) -> str:
 def _opening(sweep: Sweep, judged: pd.DataFrame) -> str:
     """Return the answers and the verdict table."""
     if not len(judged):
-        return html_page.items([verdict_texts.no_verdict(sweep)], kind="answers")
+        return html_page.items([no_verdict(sweep)], kind="answers")
     return "\n".join(
         [
-            html_page.items(verdict_texts.answers(judged), kind="answers"),
-            html_page.verdict_table(verdict_texts.verdict_table(judged), verdict_texts.verdict_kinds(judged)),
-            html_page.items(verdict_texts.task_sentences(sweep, judged), kind="notes"),
-            html_page.items(verdict_texts.explanation(judged), kind="notes"),
+            html_page.items(answers(judged), kind="answers"),
+            html_page.verdict_table(verdict_table(judged), verdict_kinds(judged)),
+            html_page.items(task_sentences(sweep, judged), kind="notes"),
+            html_page.items(explanation(judged), kind="notes"),
         ]
     )
 
@@ -126,12 +129,12 @@ def _markdown(sweep: Sweep, drawn: list[Path], figures: Mapping[str, Drawing], t
     judged = tables.verdicts
     lines = [f"# {table_formats.markdown_text(sweep.name)}", ""]
     if len(judged):
-        lines += [*_list(verdict_texts.answers(judged)), ""]
-        lines += [table_formats.markdown(_marked(verdict_texts.verdict_table(judged))), ""]
-        lines += _list(verdict_texts.task_sentences(sweep, judged))
-        lines += _list(verdict_texts.explanation(judged))
+        lines += [*_list(answers(judged)), ""]
+        lines += [table_formats.markdown(_marked(verdict_table(judged))), ""]
+        lines += _list(task_sentences(sweep, judged))
+        lines += _list(explanation(judged))
     else:
-        lines.append(verdict_texts.no_verdict(sweep))
+        lines.append(no_verdict(sweep))
     lines += ["", "## Trials and warnings", "", _count(sweep), "", *_list(missing(sweep))]
     lines += ["", "## Figures", ""]
     for path in _full_sizes(drawn):

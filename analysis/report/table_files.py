@@ -16,7 +16,7 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import curriculum_flags
 from recrl.analysis.report import table_formats
 from recrl.analysis.report.text_tables import bound_table, claims_table
-from recrl.analysis.report.verdict_texts import tolerance_sentence
+from recrl.analysis.report.verdict_terms import tolerance_sentence
 from recrl.analysis.statistics import claims, metrics
 from recrl.analysis.statistics.comparisons import comparisons
 from recrl.analysis.statistics.cumulative_cost import cumulative_costs
@@ -56,8 +56,8 @@ BOUND_NOTES = {
     "trivial bound": "Trivial bound: every step at the largest cost.",
 }
 CLAIMS_NOTE = (
-    "Counted are seeds. A claim about several curricula holds in a seed if it holds in the trials of all of "
-    "them."
+    "Counted are seeds, of the paper's tasks under its deployment limits. A claim about several curricula "
+    "holds in a seed if it holds in the trials of all of them."
 )
 COMPARED_CLAIMS_NOTE = (
     "Comparisons count the seeds that have both trials. Costs of training are those of the training phase. A "

@@ -149,9 +149,8 @@ def _cost_suffix(suffixes: Sequence[str], column: str, num_costs: int) -> str:
 def with_interval(row: pd.Series, name: str) -> str:
     """Format estimate [low, high] from the three columns of an interval; without ends if they are NaN."""
     estimate, low, high = (float(row[f"{name}{end}"]) for end in ("", "_low", "_high"))
-    shown, low, high = (round(value, 2) + 0.0 for value in (estimate, low, high))  # no -0.00
-    ends = "" if math.isnan(low) else f" [{low:.2f}, {high:.2f}]"
-    return DASH if math.isnan(estimate) else f"{shown:.2f}{ends}"
+    ends = "" if math.isnan(low) else f" [{low:z.2f}, {high:z.2f}]"  # z: no -0.00
+    return DASH if math.isnan(estimate) else f"{estimate:z.2f}{ends}"
 
 
 def p_value(value: float) -> str:

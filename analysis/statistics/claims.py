@@ -11,6 +11,8 @@ and beside it the paper's relative gains. Only trials with the labels ``ppo-lag`
 counted are which static curriculum is the best in how many tasks, and that the costs of training of
 ``dynamic`` and ``linear`` are comparable.
 
+Only trials of the paper's tasks are counted: under its deployment limit (``PAPER_LIMITS``) and with one cost.
+
 The fraction of seeds has Wilson's interval. Beside it is the count for the deployment phase, in which
 learning goes on. The predicates use the tolerance of ``recrl.analysis.statistics.verdicts``. A failed trial
 has no final policy and an incomplete training: a claim does not hold in a seed with one.
@@ -41,6 +43,7 @@ STATIC = ("linear", "cosine", "exponential")
 CURRICULA = (*STATIC, "dynamic")
 PAPER_TASKS = ("CarButton2", "CarGoal2", "CarPush2")
 PAPER_AGENTS = ("ppo-lag", "cpo")
+PAPER_LIMITS = {"rivergrid-1a": 5.0, "rivergrid-1b": 1.0} | dict.fromkeys(PAPER_TASKS, 25.0)  # d_d
 RETURN = "episode_return"
 TRAINING_COST = "training_cost"
 FEASIBLE_PAIRS = ("feasible_pairs", "deployment_feasible_pairs")
@@ -149,8 +152,7 @@ def count_claims(rows: pd.DataFrame, training: pd.DataFrame, trials: pd.DataFram
 
     Args:
         rows: of ``metrics.outcomes``.
-        training: of ``metrics.training_totals``; costs of training are compared if there is one cost, and
-            only those of complete trials.
+        training: of ``metrics.training_totals``; only those of complete trials are compared.
         trials: of the sweep, complete or not.
 
     Returns:
@@ -162,17 +164,16 @@ def count_claims(rows: pd.DataFrame, training: pd.DataFrame, trials: pd.DataFram
         feasible_pairs and deployment_feasible_pairs, the seeds whose two policies are feasible; the others
         count, too. No row without such seeds.
     """
+    trials = trials[_is_of_the_paper(trials)]
     final, deployed = (
-        rows[rows["measure"] == measure.value] for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
+        _of_trials(rows[rows["measure"] == measure.value], trials)
+        for measure in (Measure.STOCHASTIC, Measure.DEPLOYMENT)
     )
-    complete = set(_keys(trials[trials["status"] == TrialStatus.COMPLETE.value]))
-    costs = training[np.array([key in complete for key in _keys(training)], dtype=bool)]
+    costs = _of_trials(training, trials[trials["status"] == TrialStatus.COMPLETE.value])
     costs = costs.assign(**{TRAINING_COST: costs["cost_0_total"] / costs["episodes"]})
     lines = []
     for claim in CLAIMS:
         of_training = isinstance(claim, Comparison) and claim.quantity == TRAINING_COST
-        if of_training and "cost_1_total" in training:
-            continue
         chosen, beside, planned = (
             _about(frame, claim) for frame in (costs if of_training else final, deployed, trials)
         )
@@ -188,6 +189,20 @@ def count_claims(rows: pd.DataFrame, training: pd.DataFrame, trials: pd.DataFram
                 lines.append(named | counted)
     table = pd.DataFrame(lines)
     return table.astype(dict.fromkeys(FEASIBLE_PAIRS, "Int64")) if lines else table
+
+
+def _is_of_the_paper(trials: pd.DataFrame) -> pd.Series[bool]:
+    """Whether each trial is of one of the paper's tasks, under the paper's limit and with one cost."""
+    others = [name for name in trials if str(name).startswith("deploy_limit_") and name != "deploy_limit_0"]
+    limits = trials["task"].astype(str).map(PAPER_LIMITS)
+    is_named = trials["task_name"] == trials["task"].astype(str) if "task_name" in trials else True
+    return (trials["deploy_limit_0"] == limits) & trials[others].isna().all(axis=1) & is_named
+
+
+def _of_trials(rows: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows that belong to some trials."""
+    known = set(_keys(trials))
+    return rows[np.array([key in known for key in _keys(rows)], dtype=bool)]
 
 
 def _keys(rows: pd.DataFrame) -> list[tuple[Any, ...]]:

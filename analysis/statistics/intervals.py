@@ -336,8 +336,8 @@ def _t_test(
     reach = _reach(error, degrees)
     if (np.abs(apart) <= max(tie, rounding)).all():
         p_value = 1.0
-    elif error <= rounding:
-        p_value = math.nan
+    elif error <= rounding:  # equal differences say nothing about how they scatter
+        return Difference(difference, math.nan, math.nan, runs, False, math.nan)
     else:
         p_value = 2.0 * float(stdtr(degrees, -abs(difference) / error))
     return Difference(difference, difference - reach, difference + reach, runs, False, p_value)

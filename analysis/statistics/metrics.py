@@ -23,7 +23,7 @@ from recrl.analysis.statistics.intervals import (
     stratified_bootstrap,
     wilson_interval,
 )
-from recrl.analysis.statistics.verdicts import is_cost, solved, within_limits, worst_costs
+from recrl.analysis.statistics.verdicts import exceeded_costs, is_cost, solved, within_limits
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.spec import TrialStatus
 
@@ -55,7 +55,7 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
         cost_i, cost_i_se (standard errors over the trial's episodes, 0 where exact), trial_id, cpu_seconds
         (of the trial: MLflow tells its outcome from that of an earlier run), deploy_limit_i, optimal_return,
         gap (J*(d_d) minus the return; the regret of a feasible trial), feasible, optimal (solved; False where
-        J* is not known), worst_cost, worst_excess and worst_share (of ``worst_costs``).
+        J* is not known), excess_i (of ``exceeded_costs``).
     """
     costs = [f"cost_{i}" for i in range(sweep.num_costs)]
     final = _with_exact(_frozen(sweep, costs), sweep.exact)
@@ -68,7 +68,7 @@ def outcomes(sweep: Sweep) -> pd.DataFrame:
     rows["gap"] = rows["optimal_return"] - rows["episode_return"]
     rows["feasible"] = within_limits(rows)
     rows["optimal"] = solved(rows)
-    rows = rows.join(worst_costs(rows))
+    rows = rows.join(exceeded_costs(rows))
     order = {measure.value: position for position, measure in enumerate(Measure)}
     by_measure = rows["measure"].map(order).rename("_order")
     rows = rows.assign(_order=by_measure).sort_values([*KEY, "_order"], kind="stable", ignore_index=True)

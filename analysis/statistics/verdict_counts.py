@@ -15,7 +15,7 @@ import pandas as pd
 
 from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.statistics.metrics import Measure
-from recrl.analysis.statistics.verdicts import is_cost, worst_costs
+from recrl.analysis.statistics.verdicts import exceeded_costs, is_cost
 from recrl.orchestrator.files.outcomes_file import VERDICT_MEASURE
 from recrl.orchestrator.spec import TrialStatus
 
@@ -41,10 +41,9 @@ def count_verdicts(
     Returns:
         GROUP, seeds (evaluated final policies), solved, feasible (the solved ones included), infeasible;
         planned (all trials), failed, pending (neither complete nor failed: they wait, run or are damaged);
-        worst_excess (the largest cost above its limit among the infeasible seeds, or NaN; of several costs
-        the one furthest above its limit, as a fraction of the limit); worst_share (the same divided by that
-        limit); for several costs worst_cost (the name of that cost, or empty) and cost_name_i (empty if the
-        task has no cost i);
+        exceeded_i (evaluated final policies that exceed limit i), excess_i_low and excess_i_high (least and
+        largest excess among them, NaN if there are none); cost_name_i, only if a task has several costs
+        (empty if the task has one cost, or no cost i);
         episode_return and cost_i (means over seeds, with standard errors _se; NaN for one seed);
         deploy_limit_i, optimal_return, exact (whether every seed is; false without a seed), episodes (of a
         seed); deployment_return and deployment_cost_i (likewise, with _se); no_curriculum and hard_landing
@@ -63,10 +62,8 @@ def count_verdicts(
         line = dict(zip(GROUP, group, strict=True)) | _counts(seeds) | _states(planned["status"])
         task = str(group[0])
         limits = {name: float(planned[f"deploy_{name.replace('cost', 'limit')}"].iloc[0]) for name in costs}
-        named = dict(zip(costs, (names or {}).get(task, ()), strict=False)) or {
-            name: name.removeprefix("cost_") for name, limit in limits.items() if not math.isnan(limit)
-        }
-        line |= _worst(seeds, limits, named)
+        line |= _excesses(seeds)
+        line |= _cost_names(limits, (names or {}).get(task, ()))
         for name in ("episode_return", *costs):
             line |= {name: seeds[name].mean(), f"{name}_se": seeds[name].sem()}
         line["optimal_return"] = planned["optimal_return"].iloc[0]
@@ -102,28 +99,29 @@ def _states(status: pd.Series[str]) -> dict[str, int]:
     return {"planned": len(status), "failed": failed, "pending": len(status) - complete - failed}
 
 
-def _worst(
-    seeds: pd.DataFrame, limits: Mapping[str, float], named: Mapping[str, str]
-) -> dict[str, float | str]:
-    """Return the largest excess among the infeasible seeds, its fraction of the limit, and its cost.
+def _excesses(seeds: pd.DataFrame) -> dict[str, float]:
+    """Return for each cost how many policies exceed its limit, and the least and the largest excess."""
+    found: dict[str, float] = {}
+    for name, excess in exceeded_costs(seeds).items():
+        i = str(name).removeprefix("excess_")
+        found |= {f"exceeded_{i}": int(excess.notna().sum())}
+        found |= {f"excess_{i}_low": excess.min(), f"excess_{i}_high": excess.max()}
+    return found
 
-    It is chosen as in ``verdicts.worst_costs``.
+
+def _cost_names(limits: Mapping[str, float], names: Sequence[str]) -> dict[str, str]:
+    """Return the columns cost_name_i of a task; none if the sweep has one cost only.
+
+    Args:
+        limits: of each cost of the sweep, NaN if the task lacks it.
+        names: of the task's costs; empty if they are not known.
     """
-    found: dict[str, float | str] = {"worst_excess": math.nan, "worst_share": math.nan}
-    cost = ""
-    exceeded = worst_costs(seeds).dropna().sort_values(["worst_share", "worst_excess"], kind="stable")
-    if len(exceeded):
-        worst = exceeded.iloc[-1]
-        cost = named.get(f"cost_{worst['worst_cost']}", "")
-        share = worst["worst_share"] if math.isfinite(worst["worst_share"]) else math.nan
-        found = {"worst_excess": worst["worst_excess"], "worst_share": share}
     if len(limits) == 1:
-        return found
-    return (
-        found
-        | {"worst_cost": cost}
-        | {name.replace("cost", "cost_name"): named.get(name, "") for name in limits}
-    )
+        return {}
+    present = [name for name, limit in limits.items() if not math.isnan(limit)]
+    numbers = [name.removeprefix("cost_") for name in present]
+    named = dict(zip(present, names or numbers, strict=False)) if len(present) > 1 else {}
+    return {name.replace("cost", "cost_name"): named.get(name, "") for name in limits}
 
 
 def _differences(compared: pd.DataFrame) -> pd.DataFrame:

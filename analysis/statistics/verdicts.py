@@ -45,27 +45,21 @@ def within_limit(rows: pd.DataFrame, i: str) -> pd.Series[bool]:
     return (rows[f"cost_{i}"] <= limit + tolerance(limit, errors)) | limit.isna()
 
 
-def worst_costs(rows: pd.DataFrame) -> pd.DataFrame:
-    """Find the cost of each row that is furthest above its limit, as a fraction of that limit.
-
-    Costs may have different units, so fractions are compared. Any excess of a limit of 0 is the largest.
+def exceeded_costs(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return by how much each row exceeds its limits.
 
     Args:
         rows: as for ``within_limit``, for every cost.
 
     Returns:
-        worst_cost (its index, as text), worst_excess (cost minus limit) and worst_share (the same divided by
-        the limit; infinite at a limit of 0), with the index of ``rows``; NaN where no limit is exceeded by
-        more than its tolerance.
+        excess_i of every cost (cost minus limit; NaN where the cost is at most its limit plus
+        ``tolerance``), with the index of ``rows``.
     """
-    found = []
-    for i in costs_of(rows):
-        limit = rows[f"deploy_limit_{i}"]
-        excess = (rows[f"cost_{i}"] - limit).mask(within_limit(rows, i))
-        share = (excess / limit.where(limit > 0.0)).mask(excess.notna() & (limit <= 0.0), math.inf)
-        found.append(pd.DataFrame({"worst_cost": i, "worst_excess": excess, "worst_share": share}))
-    exceeded = pd.concat(found).dropna().sort_values(["worst_share", "worst_excess"], kind="stable")
-    return exceeded.groupby(level=0).last().reindex(rows.index)
+    excesses = {
+        f"excess_{i}": (rows[f"cost_{i}"] - rows[f"deploy_limit_{i}"]).mask(within_limit(rows, i))
+        for i in costs_of(rows)
+    }
+    return pd.DataFrame(excesses, index=rows.index)
 
 
 def tolerance(limits: pd.Series[float], errors: pd.Series[float]) -> pd.Series[float]:
@@ -100,9 +94,9 @@ def tie(optimal_return: float) -> float:
     return (SOLVED_GAP if math.isfinite(optimal_return) else 0.0) + ROUNDING
 
 
-def costs_of(rows: pd.DataFrame) -> list[str]:
-    """Return each i with a column deploy_limit_i."""
-    names = [str(name) for name in rows]
+def costs_of(rows: pd.DataFrame | pd.Series) -> list[str]:
+    """Return each i with a column deploy_limit_i; of one row, with such an entry."""
+    names = map(str, rows.columns if isinstance(rows, pd.DataFrame) else rows.index)
     return [name.removeprefix("deploy_limit_") for name in names if name.startswith("deploy_limit_")]
 
 

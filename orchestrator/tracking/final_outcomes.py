@@ -41,11 +41,9 @@ class FinalOutcome:
         costs: episode costs, likewise, [k].
         limits: d_d, [k].
         is_feasible: whether every cost is within its limit and the tolerance.
-        worst_cost: index of the cost that is furthest above its limit, as a fraction of it; None if feasible.
-        worst_excess: how far it is above its limit.
-        worst_share: the same divided by the limit; infinite at a limit of 0.
         is_solved: whether it is also near a known optimum.
         exact: whether the values were computed, not sampled.
+        excesses: how far each cost is above its limit; 0 where it is within the tolerance, [k].
         cpu_seconds: CPU time of the trial, which differs from that of an earlier run; None if not known.
     """
 
@@ -57,9 +55,7 @@ class FinalOutcome:
     is_feasible: bool
     is_solved: bool
     exact: bool
-    worst_cost: int | None = None
-    worst_excess: float = 0.0
-    worst_share: float = 0.0
+    excesses: tuple[float, ...] = ()
     cpu_seconds: float | None = None
 
     @property
@@ -190,7 +186,7 @@ def verdict_lines(
 
 
 def _verdicts(seeds: Sequence[FinalOutcome], states: Sequence[TrialStatus]) -> str:
-    """Count a group's verdicts: ``solved 2 of 5, infeasible 2 of 5 by up to 0.28, failed 1 of 5``."""
+    """Count a group's verdicts: ``solved 2 of 5; infeasible 2 of 5 by up to 0.28; failed 1 of 5``."""
     failed = states.count(TrialStatus.FAILED)
     total = len(states)
     parts = []
@@ -203,16 +199,21 @@ def _verdicts(seeds: Sequence[FinalOutcome], states: Sequence[TrialStatus]) -> s
     for name, number in without.items():
         if number > 0:
             parts.append(f"{name} {number} of {total}" if number < total else name)
-    return ", ".join(parts)
+    return "; ".join(parts)
 
 
 def _by(outcomes: Sequence[FinalOutcome]) -> str:
-    """Return the largest excess of infeasible policies, as in `` by up to 0.28``; of several costs, which."""
-    worst = max(outcomes, key=lambda it: (it.worst_share, it.worst_excess))
-    if worst.worst_cost is None:
-        return ""
-    cost = f", cost {worst.worst_cost}" if len(worst.costs) > 1 else ""
-    return f"{cost} by {'up to ' * (len(outcomes) > 1)}{_text(worst.worst_excess)}"
+    """Return the largest excess of each exceeded cost of some policies; empty if they are feasible.
+
+    One cost: `` by up to 0.28``. Several: ``, cost 0 by up to 0.50, cost 1 by up to 0.25``.
+    """
+    largest = [max(values) for values in zip(*(it.excesses for it in outcomes), strict=True)]
+    by = "by up to" if len(outcomes) > 1 else "by"
+    return "".join(
+        f"{f', cost {i}' if len(largest) > 1 else ''} {by} {_text(excess)}"
+        for i, excess in enumerate(largest)
+        if excess > 0.0
+    )
 
 
 def _outcome(row: Mapping[str, str]) -> FinalOutcome:
@@ -227,9 +228,7 @@ def _outcome(row: Mapping[str, str]) -> FinalOutcome:
         is_feasible=row["feasible"] == "True",
         is_solved=row["optimal"] == "True",
         exact=row["exact"] == "True",
-        worst_cost=int(row["worst_cost"]) if row["worst_cost"] else None,
-        worst_excess=float(row["worst_excess"] or 0.0),
-        worst_share=float(row["worst_share"] or 0.0),
+        excesses=tuple(float(row[f"excess_{name.removeprefix('cost_')}"] or 0.0) for name in costs),
         cpu_seconds=float(row["cpu_seconds"]) if row.get("cpu_seconds") else None,
     )
 
@@ -243,4 +242,7 @@ def _listed(values: Sequence[float], *, digits: int = 2) -> str:
 
 
 def _text(value: float) -> str:
-    return f"{value:.3f}" if 0.0 < abs(value) < 0.1 else f"{value:.2f}"
+    size = abs(value)
+    if 1e-9 <= size < 0.01:  # 0.000 would read as none
+        return f"{value:.2g}"
+    return f"{value:z.{3 if 0.01 <= size < 0.1 else 2}f}"  # z: no -0.00

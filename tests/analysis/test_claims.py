@@ -19,6 +19,7 @@ def counted(
     trials = pd.concat([rows.assign(status="complete"), training.assign(status="complete")])
     if failed is not None:
         trials = pd.concat([trials, failed.assign(status="failed")])
+    trials["deploy_limit_0"] = trials["deploy_limit_0"].fillna(trials["task"].map(claims.PAPER_LIMITS))
     return claims.count_claims(rows, training, trials)
 
 
@@ -188,11 +189,20 @@ def test_a_failed_trial_makes_no_comparison_that_the_sweep_does_not_have() -> No
     assert alone["claim"].tolist() == ["ppo-lag keeps d_d on CarGoal2 (here: linear)"]
 
 
-def test_a_failed_trial_revives_no_comparison_of_training_with_several_costs() -> None:
-    training = NO_TRAINING.assign(cost_1_total=[])
-    lost = pd.DataFrame([trial(method, 0, 0.0) for method in ("linear", "exponential")])
-    weighed = counted(pd.DataFrame([trial("none", 0, 3.0)]), training, failed=lost)
-    assert not weighed["claim"].str.contains("costs more in training").any()
+def test_the_papers_claims_are_about_its_own_tasks_limits_and_single_cost() -> None:
+    rows = [trial(method, 0, 3.0) for method in ("none", "linear")]
+    assert len(counted(pd.DataFrame(rows))) == 2
+    for other in ({"deploy_limit_0": 50.0}, {"deploy_limit_1": 9.0}, {"task_name": "mine:CarGoal2"}):
+        assert counted(pd.DataFrame([{"task_name": "CarGoal2", **row, **other} for row in rows])).empty
+
+
+def test_a_task_with_two_costs_hides_no_training_cost_of_the_others() -> None:
+    methods = ("linear", "cosine", "exponential")
+    single = [trial(method, 0, 1.0, cost_1=math.nan) for method in methods]
+    other = [{**row, "task": "two-state-2", "cost_1": 1.0, "deploy_limit_1": 9.0} for row in single]
+    training = totals().assign(cost_1_total=math.nan)
+    weighed = counted(pd.DataFrame([*single, *other]), training)
+    assert weighed["claim"].str.contains("costs more in training").sum() == 3
 
 
 def test_dynamic_is_compared_with_each_static_curriculum_of_its_agent() -> None:
@@ -285,9 +295,3 @@ def test_a_comparison_all_of_whose_seeds_failed_holds_nowhere_and_has_no_verdict
     weighed = claims.count_claims(rows, totals(), trials)
     shown = claims_table(weighed).set_index("claim").loc[claim]
     assert list(shown[["holds here", "holds in", "difference"]]) == ["", "0 of 1", ""]
-
-
-def test_costs_of_training_are_not_compared_by_one_of_several_costs() -> None:
-    rows = [trial(method, 0, 1.0) for method in ("linear", "cosine", "exponential")]
-    weighed = counted(pd.DataFrame(rows), totals(cost_1_total=1.0))
-    assert weighed["difference"].isna().all()

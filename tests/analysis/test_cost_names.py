@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import pytest
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.cost_names import cost_names, cost_suffix, indices_of_cost
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.report import drawing, table_formats, verdict_texts
+from recrl.analysis.report import drawing, table_formats
+from recrl.analysis.report.verdict_table import verdict_text
 from recrl.analysis.statistics import cumulative_cost, metrics
 from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.cli.result_table import result_table
@@ -62,16 +64,17 @@ def test_titles_of_tables_have_the_names(two: Sweep) -> None:
     [
         ("noise", 1, 1, "infeasible: noise by 0.22 (11%)"),
         ("1", 2, 2, "infeasible: cost 1 by up to 0.22 (11%)"),
-        ("noise", 5, 1, "feasible 4 of 5; infeasible 1 of 5, noise by up to 0.22 (11%)"),
+        ("noise", 5, 1, "feasible 4 of 5; infeasible 1 of 5: noise by up to 0.22 (11%)"),
     ],
 )
 def test_a_verdict_names_the_cost_that_is_over_its_limit(
     cost: str, seeds: int, infeasible: int, text: str
 ) -> None:
-    row = {"seeds": seeds, "solved": 0, "feasible": seeds - infeasible, "infeasible": infeasible}
-    row |= {"planned": seeds, "failed": 0, "pending": 0}
-    worst = {"worst_excess": 0.22, "worst_share": 0.11, "worst_cost": cost}
-    assert verdict_texts.verdict_text(pd.Series(row | worst)) == text
+    row: dict[str, object] = {"seeds": seeds, "planned": seeds, "failed": 0, "pending": 0}
+    row |= {"solved": 0, "feasible": seeds - infeasible, "infeasible": infeasible}
+    row |= {"exceeded_0": 0, "excess_0_high": math.nan, "deploy_limit_0": 5.0, "cost_name_0": "fuel"}
+    row |= {"exceeded_1": infeasible, "excess_1_high": 0.22, "deploy_limit_1": 2.0, "cost_name_1": cost}
+    assert verdict_text(pd.Series(row)) == text
 
 
 def test_a_cost_is_found_by_its_index_from_0_or_by_its_name(two: Sweep) -> None:

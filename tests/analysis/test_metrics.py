@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -38,6 +39,12 @@ def test_exact_values_need_no_sampled_episodes(finished: Sweep) -> None:
     assert final["exact"].all()
     assert set(final["episodes"]) == {0}
     assert set(final["episode_return_se"]) == {0.0}
+
+
+def test_a_sweep_without_trials_has_no_outcomes(tmp_path: Path) -> None:
+    rows = metrics.outcomes(sweep_data.load(SweepStore(tmp_path, "empty")))
+    assert len(rows) == 0
+    assert {"feasible", "optimal"} <= set(rows)
 
 
 def test_the_gap_is_the_optimum_minus_the_return(finished: Sweep) -> None:

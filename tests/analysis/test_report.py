@@ -10,8 +10,9 @@ import pytest
 
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.report import drawing, figure_list, table_files, verdict_texts
+from recrl.analysis.report import drawing, figure_list, table_files
 from recrl.analysis.report.figure_list import NothingToDrawError
+from recrl.analysis.report.verdict_answers import no_verdict
 from recrl.orchestrator.files.sweep_store import SweepStore
 from tests.faults.committing import commit_file
 
@@ -143,15 +144,13 @@ def test_trials_without_an_evaluation_are_not_said_to_be_incomplete(finished: Sw
     unevaluated = dataclasses.replace(finished, evaluations=finished.evaluations.iloc[:0])
     _, tables = table_files.write_tables(unevaluated, tmp_path)
     assert not len(tables.verdicts)
-    assert verdict_texts.no_verdict(unevaluated) == (
-        "No final policy was evaluated: set run.evaluation_episodes."
-    )
+    assert no_verdict(unevaluated) == ("No final policy was evaluated: set run.evaluation_episodes.")
     for status, sentence in (
         ("failed", "No verdict: all 36 trials failed."),
         ("running", "No trial is complete yet: no verdict."),
     ):
         trials = finished.trials.assign(status=status)
-        assert verdict_texts.no_verdict(dataclasses.replace(finished, trials=trials)) == sentence
+        assert no_verdict(dataclasses.replace(finished, trials=trials)) == sentence
 
 
 def test_a_report_of_failed_trials_alone_says_so(finished: Sweep, tmp_path: Path) -> None:

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 
+from recrl.analysis.data.number_texts import number, with_error
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report import table_files, table_formats
 from recrl.analysis.statistics import metrics
@@ -138,7 +140,7 @@ def test_tables_with_several_intervals_say_that_they_are_not_corrected(
     weighed = weighed.assign(share_low=0.57, share_high=1.0, deployment_held=0, deployment_seeds=0, failed=0)
     weighed = weighed.assign(difference=math.nan, feasible_pairs=None, deployment_feasible_pairs=None)
     note = table_files._claims(weighed).note
-    assert note.startswith("Counted are seeds.")
+    assert note.startswith("Counted are seeds")
     assert note.endswith("Intervals in this table: 2, of 95% each, not corrected for their number.")
 
 
@@ -160,6 +162,33 @@ def test_a_task_has_rows_of_its_own_measures_only(finished: Sweep) -> None:
     summary = metrics.summary(rows, with_failures(finished).trials)
     assert set(summary[summary["task"] == "river-b"]["measure"]) == {"stochastic"}
     assert {"stochastic", "deterministic"} <= set(summary[summary["task"] == "river-a"]["measure"])
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (-0.0, "0.00"),
+        (-1e-13, "0.00"),  # rounding
+        (0.0004, "0.0004"),
+        (-0.00456, "-0.0046"),
+        (0.0099, "0.0099"),
+        (0.00999, "0.01"),
+        (0.01, "0.010"),
+        (0.0996, "0.100"),
+        (-0.5, "-0.50"),
+        (-128.44, "-128.4"),
+        (math.inf, "inf"),
+        (math.nan, "–"),
+    ],
+)
+def test_a_small_number_has_two_digits_and_none_is_a_minus_zero(value: float, text: str) -> None:
+    assert number(value) == text
+
+
+def test_means_and_intervals_have_no_minus_zero() -> None:
+    assert with_error(-0.004, 0.012) == "0.00 ± 0.01"
+    row = pd.Series({"gain": -0.001, "gain_low": -0.004, "gain_high": 0.002})
+    assert table_formats.with_interval(row, "gain") == "0.00 [0.00, 0.00]"
 
 
 def test_markdown_and_latex_by_hand() -> None:

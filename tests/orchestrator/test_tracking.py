@@ -69,12 +69,13 @@ def test_twelve_costs_are_in_their_order() -> None:
     costs = {f"cost_{i}": str(float(i)) for i in range(12)}
     limits = {f"deploy_limit_{i}": str(100.0 + i) for i in range(12)}
     verdict = {"feasible": "True", "optimal": "False", "exact": "False", "episode_return": "1"}
-    verdict |= dict.fromkeys(("worst_cost", "worst_excess", "worst_share"), "")
+    verdict |= {f"excess_{i}": str(0.5 * i) if i in (2, 11) else "" for i in range(12)}
     outcome = _outcome(
         {"trial_id": "x", "task": "t", "agent": "a", "method": "m", **costs, **limits, **verdict}
     )
     assert outcome.costs == tuple(map(float, range(12)))
     assert outcome.limits == tuple(100.0 + i for i in range(12))
+    assert outcome.excesses == (0.0, 0.0, 1.0, *[0.0] * 8, 5.5)
 
 
 def test_a_database_that_another_process_made_first_is_kept(
@@ -105,7 +106,7 @@ def test_a_full_disk_ends_a_pass_and_not_the_process(
 
     tracker = mlflow_sync.Tracker(SweepStore(tmp_path, "s"), "sqlite:///x.db")
     monkeypatch.setattr(tracker, "bring_up_to_date", full)
-    report = background_sync._pass(tracker, live=True)
+    report = background_sync._pass(tracker, mlflow_sync.SyncReport(), live=True)
     assert "No space left" in report.problem
     assert not report.is_up_to_date
     assert "No space left" in capsys.readouterr().out
@@ -493,6 +494,41 @@ def test_a_damaged_position_is_made_anew(write: Callable[..., SweepStore], text:
     assert everything(store) == shown
 
 
+def test_a_damaged_trial_is_failed_and_the_others_go_on(
+    half_and_done: tuple[SweepStore, SweepStore], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, done = half_and_done
+    uri = tracking_uri(store, None)
+    tracker = mlflow_sync.Tracker(store, uri)
+    assert tracker.bring_up_to_date(live=True).is_up_to_date
+    trial = trial_titled(store, NONE)
+    whole = trial.episodes_path.read_bytes()
+    trial.episodes_path.write_bytes(whole[:-9])
+    points = len(history(store, runs(store)[NONE])["agent/kl"])
+    monkeypatch.setattr(mlflow_sync, "_View", None)  # must not be needed again
+    report = tracker.bring_up_to_date(live=True)
+    assert (report.problem, report.behind, report.is_broken_off) == ("", 0, False)
+    shown = runs(store)[NONE]
+    assert (shown.info.status, shown.data.tags["recrl.status"]) == ("FAILED", "damaged")
+    assert shown.data.tags["recrl.error"] == trial.record().error
+    assert len(history(store, shown)["agent/kl"]) == points
+    grow(store, done, DYNAMIC)
+    assert tracker.bring_up_to_date(live=True).points > 0  # of the other trial
+    trial.episodes_path.write_bytes(whole)
+    assert tracker.bring_up_to_date(live=True).is_up_to_date
+    mended = runs(store)[NONE]
+    assert (mended.info.status, mended.data.tags.get("recrl.error")) == ("FINISHED", None)
+
+
+def test_rows_that_changed_in_a_byte_break_no_pass_off(write: Callable[..., SweepStore]) -> None:
+    store = write()
+    path = trial_titled(store, NONE).updates_path
+    path.write_bytes(path.read_bytes()[:-2] + b"x\n")
+    report = sync(store, tracking_uri(store, None))
+    assert (report.behind, report.is_broken_off) == (1, False)
+    assert "updates.csv is not what was committed: its checksum differs" in report.problem
+
+
 def test_a_run_deleted_by_hand_is_made_again(write: Callable[..., SweepStore]) -> None:
     store = write()
     uri = tracking_uri(store, None)
@@ -611,10 +647,10 @@ def write_outcomes(store: SweepStore, *, dynamic_cost: float = 9.0625) -> None:
     none, dynamic = (trial_titled(store, title).spec.trial_id for title in (NONE, DYNAMIC))
     store.figures_folder.mkdir(exist_ok=True)
     (store.figures_folder / "outcomes.csv").write_text(f"""\
-trial_id,task,agent,method,seed,measure,exact,episode_return,cost_0,deploy_limit_0,feasible,optimal,worst_cost,worst_excess,worst_share
-{none},river-a,cpo,none,0,deployment,False,1.0,9.0,5.0,False,False,0,4.0,0.8
-{none},river-a,cpo,none,0,stochastic,True,14.0,5.0,5.0,True,True,,,
-{dynamic},river-a,cpo,dynamic,0,stochastic,True,15.0,{dynamic_cost},5.0,False,False,0,{dynamic_cost - 5.0},0.8
+trial_id,task,agent,method,seed,measure,exact,episode_return,cost_0,deploy_limit_0,feasible,optimal,excess_0
+{none},river-a,cpo,none,0,deployment,False,1.0,9.0,5.0,False,False,4.0
+{none},river-a,cpo,none,0,stochastic,True,14.0,5.0,5.0,True,True,
+{dynamic},river-a,cpo,dynamic,0,stochastic,True,15.0,{dynamic_cost},5.0,False,False,{dynamic_cost - 5.0}
 """)
 
 
@@ -784,15 +820,28 @@ def test_sync_rebuilds_what_mlflow_shows(
     assert rebuilt.data.metrics == sent.data.metrics
 
 
-def test_of_several_costs_the_verdict_names_the_one_of_the_report() -> None:
-    """The cost that is furthest above its limit as a fraction; cost 1 may be within its tolerance."""
+def test_the_verdict_names_every_cost_above_its_limit() -> None:
+    """Cost 1 of the first policy is within its tolerance."""
     group = ("map", "cpo", "none")
-    none = FinalOutcome("a", group, 4.0, (5.5, 1050.0), (5.0, 1000.0), False, False, False)
-    near = replace(none, worst_cost=0, worst_excess=0.5, worst_share=0.1)
-    zero = replace(none, worst_cost=1, worst_excess=0.25, worst_share=math.inf)
-    assert trial_note(near, (9.0, 9.0)).startswith("**infeasible, cost 0 by 0.50**: ")
-    assert trial_note(zero, (9.0, 9.0)).startswith("**infeasible, cost 1 by 0.25**: ")
-    assert "infeasible, cost 1 by up to 0.25 |" in verdict_lines([near, zero], {group: []})[2]
+    costs, limits = (5.5, 1050.0), (5.0, 1000.0)
+    one = FinalOutcome("a", group, 4.0, costs, limits, False, False, False, excesses=(0.5, 0.0))
+    both = replace(one, excesses=(0.25, 50.0))
+    assert trial_note(one, (9.0, 9.0)).startswith("**infeasible, cost 0 by 0.50**: ")
+    assert trial_note(both, (9.0, 9.0)).startswith("**infeasible, cost 0 by 0.25, cost 1 by 50.00**: ")
+    states = {group: [TrialStatus.COMPLETE, TrialStatus.COMPLETE, TrialStatus.FAILED]}
+    assert (
+        "| infeasible 2 of 3, cost 0 by up to 0.50, cost 1 by up to 50.00; failed 1 of 3 |"
+        in verdict_lines([one, both], states)[2]
+    )
+
+
+def test_outcomes_of_an_older_version_count_as_not_written(write: Callable[..., SweepStore]) -> None:
+    store = write()
+    write_outcomes(store)
+    assert not FinalOutcomes(store).lack_a_complete_trial()
+    path = store.figures_folder / "outcomes.csv"
+    path.write_text(path.read_text().replace("excess_0", "worst_excess"))
+    assert FinalOutcomes(store).lack_a_complete_trial()
 
 
 def test_failed_trials_are_in_the_table_of_verdicts() -> None:
@@ -804,12 +853,12 @@ def test_failed_trials_are_in_the_table_of_verdicts() -> None:
     complete, failed, waiting = TrialStatus.COMPLETE, TrialStatus.FAILED, TrialStatus.WAITING
     states = {group: [complete, failed, complete, failed, waiting], other: [failed, failed]}
     assert verdict_lines(outcomes, states)[2:] == [
-        "| map | cpo | none | solved 1 of 5, feasible 1 of 5, failed 2 of 5, no result yet 1 of 5 "
+        "| map | cpo | none | solved 1 of 5; feasible 1 of 5; failed 2 of 5; no result yet 1 of 5 "
         "| 1.000 | 1.00 | 4.00 | 2 |",
         "| map | cpo | linear | failed |  |  |  | 0 |",
     ]
     alone = verdict_lines(outcomes, {group: [complete, complete]})
-    assert alone[2].split(" | ")[3] == "solved 1 of 2, feasible 1 of 2"
+    assert alone[2].split(" | ")[3] == "solved 1 of 2; feasible 1 of 2"
     assert verdict_lines([], states) == []
     barred = ("map", "a|b", "none")
     renamed = [replace(outcome, group=barred) for outcome in outcomes]
