@@ -74,7 +74,7 @@ class Difference(Interval):
 
     Attributes:
         p_value: of the two-sided t test that the true difference is 0. NaN with fewer than two runs.
-            Otherwise it is 1 if all runs tie, and NaN if the standard error is 0.
+            Otherwise it is 1 if all runs tie; NaN, like the interval, if the standard error is 0.
     """
 
     p_value: float

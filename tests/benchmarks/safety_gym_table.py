@@ -2,9 +2,9 @@
 
     python -m tests.benchmarks.safety_gym_table
 
-From table.zip come the rows of final policies and of the deployment phase, the differences from ``none``,
-the claims and the figures; from these rows and those of other experiments the power. The controls and the
-confirmation have their own archives. Printed are the rows of which the pages' tables are made.
+From table.zip (``ppo-lag``) and table-cpo.zip come the rows of final policies and of the deployment phase,
+the differences from ``none``, the claims and the figures; from these rows and those of other experiments the
+power. The controls and the confirmation have their own archives. Printed are the rows of the pages' tables.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,8 @@ from tests.benchmarks.velocity_table import Cell, number
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results" / "safety-gym"
 COLOURS = 128  # of a figure in the documentation
-ARCHIVES = ("table", "controls", "early-landing", "short-training")  # with rows of the deployment phase
+TABLE_PARTS = ("table", "table-cpo")  # one archive would be too large for the repository
+CONTROLS = ("controls", "early-landing", "short-training")  # with rows of the deployment phase, as the table
 STEPS_UNDER_LIMIT = ("none", "none-short", "linear", "linear-early")  # differ in these on CarGoal2
 NOISE = ("none", "dynamic", "dynamic-without-noise")
 CURRICULA = (*STEPS_UNDER_LIMIT, "cosine", "exponential", *NOISE[1:], "step")
@@ -51,13 +52,25 @@ def transcript(commands: Sequence[str], folder: Path = RESULTS) -> str:
     return "\n".join(texts)
 
 
-def write_rows_and_tests() -> None:
+def archive_of(name: str) -> Path:
+    """Return the path of an archive in the results."""
+    return RESULTS / f"{name}.zip"
+
+
+def write_rows_and_tests(archives: Mapping[str, Path]) -> None:
     """Write the rows of the table, and the tests."""
     scripts = "../../tests/benchmarks"
+    confirm = {"button-confirm": archive_of("button-confirm")}
     transcript(
         [
-            *(f"{scripts}/final_policies.py {it}.zip --to {it}.csv" for it in (*ARCHIVES, "button-confirm")),
-            *(f"{scripts}/deployment_phase.py {it}.zip --to {it}-deployment-phase.csv" for it in ARCHIVES),
+            *(
+                f"{scripts}/final_policies.py {path} --to {it}.csv"
+                for it, path in {**archives, **confirm}.items()
+            ),
+            *(
+                f"{scripts}/deployment_phase.py {path} --to {it}-deployment-phase.csv"
+                for it, path in archives.items()
+            ),
         ]
     )
     tests = [
@@ -71,7 +84,7 @@ def write_rows_and_tests() -> None:
     powers = [
         f"tests/benchmarks/power.py {tables} --agents {labels} --tests {tests} --difference 1"
         for labels in LABELS
-        for tests in (1, 16, 24)  # those of the answer page, and of the paper's table
+        for tests in (1, 18, 24)  # those of the answer page, and of the paper's table
     ]
     (RESULTS / "power.txt").write_text(transcript(powers, ROOT))
     earlier = f"results/safety-gym/{PILOT[0]} results/safety-gym/table.csv"
@@ -79,11 +92,11 @@ def write_rows_and_tests() -> None:
     (RESULTS / "button-confirm.txt").write_text(transcript([confirm], ROOT))
 
 
-def draw() -> None:
-    """Draw the report; keep its claims, and its figures with fewer colours."""
+def draw(table: Path) -> None:
+    """Draw the report of the whole table; keep its claims, and its figures with fewer colours."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        if code := recrl_sweep(["figures", str(RESULTS / "table.zip"), "--to", name]):
+        if code := recrl_sweep(["figures", str(table), "--to", name]):
             raise SystemExit(code)
         (RESULTS / "table-claims.csv").write_bytes((folder / "claims.csv").read_bytes())
         for figure in [folder / "return-against-cost.png", *folder.glob("learning-curves_*.png")]:
@@ -223,13 +236,18 @@ def phase_table(rows: pd.DataFrame) -> Iterator[str]:
 
 def main() -> None:
     """Write the files, and print the page's tables."""
-    write_rows_and_tests()
-    draw()
-    finals = [pd.read_csv(RESULTS / f"{name}.csv") for name in ARCHIVES]
+    with tempfile.TemporaryDirectory() as folder:
+        table = Path(folder) / "table.zip"
+        if code := recrl_sweep(["merge", *map(str, map(archive_of, TABLE_PARTS)), "--to", str(table)]):
+            raise SystemExit(code)
+        archives = {"table": table, **{name: archive_of(name) for name in CONTROLS}}
+        write_rows_and_tests(archives)
+        draw(table)
+        updates = pd.concat(recrl.load_sweep(path).updates for path in archives.values())
+    finals = [pd.read_csv(RESULTS / f"{name}.csv") for name in archives]
     fresh = finals[0]
     seen = pd.concat(pd.read_csv(RESULTS / name) for name in PILOT)
-    phases = [pd.read_csv(RESULTS / f"{name}-deployment-phase.csv") for name in ARCHIVES]
-    updates = pd.concat(recrl.load_sweep(RESULTS / f"{name}.zip").updates for name in ARCHIVES)
+    phases = [pd.read_csv(RESULTS / f"{name}-deployment-phase.csv") for name in archives]
     everything = pd.concat(finals), pd.concat(phases), updates
     by_steps = of_question(pd.concat([seen, *finals]), STEPS_UNDER_LIMIT)
     by_noise = of_question(everything[0], NOISE)
