@@ -24,11 +24,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 
-from recrl.orchestrator.errors import DamagedError, StorageError
+from recrl.orchestrator.errors import DamagedError, StorageError, first_line
 from recrl.orchestrator.files.atomic_files import write_json
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.tracking.client import is_away, one_line
 from recrl.orchestrator.tracking.export_file import ExportWriter
@@ -175,7 +176,7 @@ def _kept(problems: list[str], unreadable: list[str], trial: TrialStore) -> Iter
     try:
         yield
     except StorageError as error:
-        unreadable.append(one_line(error))
+        unreadable.append(redacted(first_line(error)))
     except Exception as error:
         if is_away(error):
             raise

@@ -60,19 +60,13 @@ def archive_of(name: str) -> Path:
 def write_rows_and_tests(archives: Mapping[str, Path]) -> None:
     """Write the rows of the table, and the tests."""
     scripts = "../../tests/benchmarks"
-    confirm = {"button-confirm": archive_of("button-confirm")}
-    transcript(
-        [
-            *(
-                f"{scripts}/final_policies.py {path} --to {it}.csv"
-                for it, path in {**archives, **confirm}.items()
-            ),
-            *(
-                f"{scripts}/deployment_phase.py {path} --to {it}-deployment-phase.csv"
-                for it, path in archives.items()
-            ),
-        ]
-    )
+    finals = {**archives, "button-confirm": archive_of("button-confirm")}
+    rows = [f"{scripts}/final_policies.py {path} --to {it}.csv" for it, path in finals.items()]
+    phases = [
+        f"{scripts}/deployment_phase.py {path} --to {it}-deployment-phase.csv"
+        for it, path in archives.items()
+    ]
+    transcript([*rows, *phases])
     tests = [
         f"{scripts}/differences.py {tables} --against none{how} --policy {policy}"
         for tables in ("table.csv", f"{' '.join(PILOT)} table.csv")
@@ -237,12 +231,12 @@ def phase_table(rows: pd.DataFrame) -> Iterator[str]:
 def main() -> None:
     """Write the files, and print the page's tables."""
     with tempfile.TemporaryDirectory() as folder:
-        table = Path(folder) / "table.zip"
-        if code := recrl_sweep(["merge", *map(str, map(archive_of, TABLE_PARTS)), "--to", str(table)]):
+        whole = Path(folder) / "table.zip"
+        if code := recrl_sweep(["merge", *map(str, map(archive_of, TABLE_PARTS)), "--to", str(whole)]):
             raise SystemExit(code)
-        archives = {"table": table, **{name: archive_of(name) for name in CONTROLS}}
+        archives = {"table": whole, **{name: archive_of(name) for name in CONTROLS}}
         write_rows_and_tests(archives)
-        draw(table)
+        draw(whole)
         updates = pd.concat(recrl.load_sweep(path).updates for path in archives.values())
     finals = [pd.read_csv(RESULTS / f"{name}.csv") for name in archives]
     fresh = finals[0]

@@ -216,13 +216,28 @@ def test_a_mistake_in_a_figure_keeps_nobody_from_the_results(
     assert main(["launch", "grid.yaml", *INLINE[:-1], "--root", "elsewhere"]) == ExitCode.OK
     out = capsys.readouterr().out
     assert (
-        "Figures    not all are drawn (KeyError: 'river'), because of a bug in recrl\n"
-        "           for its traceback: recrl-sweep figures small --root elsewhere\n"
+        "Figures    not all are drawn (KeyError: 'river')\n"
+        "           this is a bug in recrl; for its traceback: recrl-sweep figures small --root elsewhere\n"
         "Results    elsewhere/small\n"
     ) in out
     assert out.endswith("small: 2 of 2 complete, 0 running, 0 waiting, 0 failed\n")
     with pytest.raises(KeyError, match="river"):
         main(["figures", "small", "--root", "elsewhere"])
+
+
+def test_a_full_disk_while_figures_are_drawn_ends_no_launch(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(learning_curves, "curricula", full)
+    assert main(["launch", "grid.yaml", *INLINE[:-1], "--root", "elsewhere"]) == ExitCode.OK
+    assert (
+        "Figures    not all are drawn (OSError: [Errno 28] No space left on device)\n"
+        "           to draw them later: recrl-sweep figures small --root elsewhere\n"
+        "Results    elsewhere/small\n"
+    ) in capsys.readouterr().out
 
 
 def test_only_some_trials(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
