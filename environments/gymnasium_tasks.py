@@ -73,17 +73,19 @@ def make_gymnasium(name: str, num_envs: int, options: GymnasiumOptions) -> SyncC
 
 
 def _check_keywords_of_id(options: GymnasiumOptions) -> None:
-    """Check that the class of a registered id takes the keywords; ``gymnasium.make`` takes some itself.
+    """Check the keywords as far as the class's signature says; ``gymnasium.make`` takes some itself.
 
     Raises:
-        ValueError: it does not.
+        ValueError: the class does not take one of them, or recrl gives it.
     """
+    if ours := {"id", "disable_env_checker"} & options.keywords.keys():
+        raise ValueError(f"keywords: {min(ours)} is given by recrl; leave it out")
     entry = gymnasium.spec(options.id.rpartition(":")[2]).entry_point
     creator = load_env_creator(entry) if isinstance(entry, str) else entry
     own = inspect.signature(gymnasium.make).parameters
     if creator is not None:
         others = {key: value for key, value in options.keywords.items() if key not in own}
-        check_keywords(creator, options.id, others)
+        check_keywords(creator, options.id, others, called="keyword")
 
 
 def keywords_of(factory: Callable[..., Environment]) -> str:

@@ -282,16 +282,19 @@ def nearest_name(name: str, known: Sequence[str]) -> str | None:
     return spelt[near[0]] if near else None
 
 
-def check_keywords(function: Callable[..., Any], name: str, keywords: Mapping[str, Any]) -> None:
+def check_keywords(
+    function: Callable[..., Any], name: str, keywords: Mapping[str, Any], *, called: str = "option"
+) -> None:
     """Check that a user's callable takes the keywords, as far as its signature says.
 
     Args:
         function: the callable.
         name: of what it makes, for the error.
-        keywords: the options for it.
+        keywords: for it.
+        called: what the grid calls one of them, for the error.
 
     Raises:
-        ValueError: it takes no such option.
+        ValueError: it takes no such keyword.
     """
     try:
         parameters = inspect.signature(function).parameters.values()
@@ -301,5 +304,5 @@ def check_keywords(function: Callable[..., Any], name: str, keywords: Mapping[st
         return
     known = [each.name for each in parameters if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)]
     for key in (key for key in keywords if key not in known):
-        options = f"its options: {', '.join(known)}" if known else "it has no options"
-        raise ValueError(f"{name} takes no option {key!r}{nearest(key, known)} ({options})")
+        known_ones = f"its {called}s: {', '.join(known)}" if known else f"it has no {called}s"
+        raise ValueError(f"{name} takes no {called} {key!r}{nearest(key, known)} ({known_ones})")

@@ -278,7 +278,8 @@ def _planned_action(record: TrialRecord, selection: TrialSelection) -> PlannedAc
         case TrialStatus.FAILED:
             return PlannedAction.RETRY if selection.retry_failed else PlannedAction.FAILED
         case TrialStatus.DAMAGED:
-            is_left_alone = record.is_left_alone and not selection.rerun_damaged
+            may_rerun = selection.rerun_damaged and not record.is_unreadable
+            is_left_alone = record.is_left_alone and not may_rerun
             return PlannedAction.DAMAGED if is_left_alone else PlannedAction.REPAIR
         case TrialStatus.WAITING | TrialStatus.RUNNING:
             return PlannedAction.RESUME if record.attempt else PlannedAction.NEW

@@ -132,14 +132,17 @@ def _run(settings: SweepRunSettings, plan: Plan, stop: threading.Event) -> Sweep
     store = settings.place.store
     sync = settings.start_sync(store) if settings.start_sync is not None else None
     synced: bool | None = None
+    patience = HASTY_SYNC_SECONDS  # also after an error
     try:
         with _reruns_requested(plan, store):
             _run_trials(settings, plan.to_do, stop)
         after = progress([trial.spec for trial in plan.trials], store)
         settings.finish(after)
+        if not stop.is_set():
+            patience = SYNC_SECONDS
     finally:
         if sync is not None:
-            synced = sync.stop(HASTY_SYNC_SECONDS if stop.is_set() else SYNC_SECONDS)
+            synced = sync.stop(patience)
     return SweepResult(plan, after, stopped=stop.is_set(), synced=synced)
 
 

@@ -2,8 +2,9 @@
 
 If every constraint holds up to a tolerance eta, the policy takes a trust-region step that increases the
 reward's surrogate. Otherwise the step decreases the surrogate of a violated cost (algorithm 1). Here this is
-the most violated cost in standard deviations of its advantages, so the costs' units do not matter. Nothing is
-carried over to the next update, so a changed limit takes effect immediately.
+the most violated cost in standard deviations of its advantages, so the costs' units do not matter. Costs that
+no step can change to first order are passed over. Nothing is carried over to the next update, so a changed
+limit takes effect immediately.
 
 Steps of constant length oscillate about the optimum; in the source's proof they are smaller the longer the
 run. Here, instead, their length depends on the remaining gain. Symbols are as in
@@ -86,13 +87,16 @@ def cost_step(problem: StepProblem, corrected: int, config: CRPOConfig) -> DualS
 
 
 def reward_step(problem: StepProblem, config: CRPOConfig) -> DualSolution:
-    """Return the module's step that increases the reward; violations, if any, are within the tolerance."""
+    """Return the module's step that increases the reward.
+
+    Violations, if any, are within the tolerance, or of costs that no step can change.
+    """
     nothing, size = np.zeros_like(problem.violations), 0.0
     if problem.squared_gradient > NO_INFLUENCE:
         size = float(np.sqrt(2.0 * problem.radius / problem.squared_gradient))
         if config.kl_penalty > 0.0:
             rises, slack = -problem.mixed, np.maximum(-problem.violations, 0.0)
-            raised = rises > 0.0
+            raised = (rises > 0.0) & (np.diag(problem.gram) > NO_INFLUENCE)
             up_to_limit = float(np.min(slack[raised] / rises[raised], initial=np.inf))
             size = min(size, up_to_limit + overshoot(problem, config))
     return DualSolution(StepCase.UNCONSTRAINED, size, nothing, nothing, ())

@@ -89,7 +89,7 @@ def make_stack(
         architecture.hidden_sizes, architecture.activation, architecture.initialiser, last_scale
     )
     factory = architecture.factory or standard(generator)
-    # A user's module draws from PyTorch's global generator; on the CPU, as all devices begin with its values.
+    # On the CPU, so that a GPU begins with the same values. A user's module draws from the global generator.
     with torch.device("cpu"), torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(torch.randint(2**31, (1,), generator=generator)))
         modules = [checked_module(factory, num_inputs, num_outputs, role=role) for _ in range(num_networks)]

@@ -79,7 +79,7 @@ def _kind(row: pd.Series) -> str:
     if row["failed"]:
         return FAILED
     if not row["seeds"]:
-        return PENDING
+        return PENDING if row["pending"] else UNEVALUATED
     return SOLVED if row["solved"] == row["planned"] else FEASIBLE
 
 
@@ -131,7 +131,7 @@ def verdict_text(row: pd.Series) -> str:
 def _excess_text(row: pd.Series) -> str:
     """Format the largest excess of each exceeded cost, as in ``energy by 3.16 (53%), hazard by 1.20 (120%)``.
 
-    A dash stands for the excess of a missing cost.
+    The excess of a missing cost is not known.
     """
     by = "by" if row["planned"] == 1 else "by up to"
     parts = []
@@ -140,7 +140,7 @@ def _excess_text(row: pd.Series) -> str:
             excess, limit = float(row[f"excess_{i}_high"]), float(row[f"deploy_limit_{i}"])
             share = f" ({_percent(excess / limit)})" if limit > 0.0 else ""
             parts.append(f"{cost_title(row, i)} {by} {number(excess)}{share}".lstrip())
-    return ", ".join(parts) or f"by {DASH}"
+    return ", ".join(parts) or "by an unknown amount"
 
 
 def cost_title(row: pd.Series, i: str) -> str:

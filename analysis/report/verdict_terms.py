@@ -38,7 +38,9 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
     )
     pending = "No result yet: the trial waits, runs or is damaged. The verdicts may still change."
     several = bool((verdicts["seeds"] > 1).any())
-    interval = ", with its 95% interval (Student's t)" if several else ""
+    interval = (
+        ", with its 95% interval (Student's t), if their differences are not all equal" if several else ""
+    )
     errors = ["A return or cost is a mean over seeds ± its standard error."] if several else []
     intervals = not_corrected(verdict_table(verdicts)[[DIFFERENCE]])
     return [

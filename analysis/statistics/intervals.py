@@ -74,7 +74,8 @@ class Difference(Interval):
 
     Attributes:
         p_value: of the two-sided t test that the true difference is 0. NaN with fewer than two runs.
-            Otherwise it is 1 if all runs tie; NaN, like the interval, if the standard error is 0.
+            Otherwise it is 1 if all runs tie. If the standard error is 0, the interval is NaN, and p, too,
+            unless all runs tie.
     """
 
     p_value: float
@@ -333,13 +334,12 @@ def _t_test(
     """
     if runs < 2:
         return Difference(difference, math.nan, math.nan, runs, True, math.nan)
-    reach = _reach(error, degrees)
+    has_spread = error > rounding  # equal differences say nothing about how they scatter
+    reach = _reach(error, degrees) if has_spread else math.nan
     if (np.abs(apart) <= max(tie, rounding)).all():
         p_value = 1.0
-    elif error <= rounding:  # equal differences say nothing about how they scatter
-        return Difference(difference, math.nan, math.nan, runs, False, math.nan)
     else:
-        p_value = 2.0 * float(stdtr(degrees, -abs(difference) / error))
+        p_value = 2.0 * float(stdtr(degrees, -abs(difference) / error)) if has_spread else math.nan
     return Difference(difference, difference - reach, difference + reach, runs, False, p_value)
 
 

@@ -13,7 +13,7 @@ from recrl.orchestrator.cli.output import say, short, show
 from recrl.orchestrator.cli.requests import BoundRequest, ReplayRequest
 from recrl.orchestrator.cli.results import say_warnings, source
 from recrl.orchestrator.cli.sweeps import open_store
-from recrl.orchestrator.errors import TRUST_HINT, USERS_ERRORS, DamagedError, RecrlError, described
+from recrl.orchestrator.errors import TRUST_HINT, USERS_ERRORS, RecrlError, StorageError, described
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.grid.only_selection import parse_only, select
@@ -84,7 +84,7 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
         elif record.committed.get(trial.updates_path.name, 0):
             try:
                 rows = replay(trial, method)
-            except DamagedError as error:
+            except StorageError as error:
                 damaged.append(str(error))
                 continue
             except RecrlError:

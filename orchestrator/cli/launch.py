@@ -79,9 +79,6 @@ def launch_and_print(
     return _say_result(outcome.result, place, options, given, console)
 
 
-TRIALS_SAVE = "running trials save their state"
-
-
 class _Printer(LaunchListener):
     """Listener that prints what a launch does."""
 
@@ -90,7 +87,7 @@ class _Printer(LaunchListener):
         self._options = options
         self._console = console
         self._store = SweepStore(options.root, grid.name)
-        self._draws = False
+        self._has_run = False  # whether all trials have ended
 
     @contextmanager
     def planned(self, plan: Plan, *, at_once: int, where: str) -> Iterator[None]:
@@ -100,6 +97,7 @@ class _Printer(LaunchListener):
         if sentence := left_out_sentence(plan):
             say(self._console, sentence)
         if not plan.to_do:
+            self._has_run = True
             yield
             return
         if self._options.executor == "ray":
@@ -109,15 +107,17 @@ class _Printer(LaunchListener):
         chosen = [trial.spec for trial in plan.trials]
         with display.live_progress(lambda: progress(chosen, self._store), self._console):
             yield
+        self._has_run = True
 
     def stopping(self) -> None:
         """Print that trials save their state, or that they have ended."""
-        what = "no trial runs any more; figures or MLflow may be left out" if self._draws else TRIALS_SAVE
+        what = "running trials save their state"
+        if self._has_run:
+            what = "no trial runs any more, figures or MLflow may be left out"
         say(self._console, f"Stopping: {what}. Press again to stop at once.")
 
     def drawing(self) -> None:
         """Print that figures are being drawn: it takes long."""
-        self._draws = True
         say(self._console, "Drawing figures ...")
 
     def drawn(self, folder: Path) -> None:
@@ -130,8 +130,8 @@ class _Printer(LaunchListener):
         if isinstance(error, RecrlError | OSError):
             say(self._console, f"           to draw them later: {command_line('figures', self._store)}")
         else:
-            traceback = command_line("figures", self._store)
-            say(self._console, f"           this is a bug in recrl; for its traceback: {traceback}")
+            again = command_line("figures", self._store)
+            say(self._console, f"           this is a bug in recrl; for its traceback: {again}")
 
     def filming(self, trials: Sequence[TrialStore]) -> None:
         """Print the place of the videos."""

@@ -98,6 +98,7 @@ class TrialReader(TrialFiles):
 
         Raises:
             DamagedError: it is not what was written.
+            StorageError: it cannot be read at present.
         """
         try:
             return self._recorded()
@@ -126,7 +127,7 @@ class TrialReader(TrialFiles):
                 continue
             try:
                 found = path.stat().st_size
-            except FileNotFoundError:
+            except NO_FILE:
                 return DamagedError(f"{name} is missing, {length:,} bytes of it are committed")
             except OSError as error:
                 return StorageError(f"{name} cannot be read ({error.strerror})")
@@ -140,7 +141,8 @@ class TrialReader(TrialFiles):
         """Return the record of a damaged trial, with a sentence on damage and remedy."""
         had_ended = recorded.attempt > 0 and recorded.status in (TrialStatus.COMPLETE, TrialStatus.FAILED)
         is_left_alone = had_ended or isinstance(error, OtherFormatError)  # its status is unknown
-        if not isinstance(error, DamagedError):
+        is_unreadable = not isinstance(error, DamagedError)
+        if is_unreadable:
             remedy = "try again when the disk can be read"
         elif self.is_local_copy:
             remedy = "the sweep's folder is only a local copy: delete it, and it is fetched again"
@@ -149,7 +151,11 @@ class TrialReader(TrialFiles):
         else:
             remedy = "the next launch continues from the intact files and moves the damaged ones aside"
         return replace(
-            recorded, status=TrialStatus.DAMAGED, is_left_alone=is_left_alone, error=f"{error}; {remedy}"
+            recorded,
+            status=TrialStatus.DAMAGED,
+            is_left_alone=is_left_alone,
+            is_unreadable=is_unreadable,
+            error=f"{error}; {remedy}",
         )
 
     def damages(self) -> list[str]:
@@ -157,29 +163,33 @@ class TrialReader(TrialFiles):
 
         Empty for an intact trial, and for a trial that was never started.
         """
+        return list(map(str, self._problems()))
+
+    def _problems(self) -> list[StorageError]:
+        """Return an error for each file that differs from its commit, or cannot be read."""
         try:
             return self._with_findings(lambda recorded: list(self._wrong_files(recorded)))[1]
         except StorageError as error:
-            return [str(error)]
+            return [error]
 
-    def _wrong_files(self, record: TrialRecord) -> Iterator[str]:
+    def _wrong_files(self, record: TrialRecord) -> Iterator[StorageError]:
         if record.status is TrialStatus.DAMAGED:
-            yield record.error
+            yield DamagedError(record.error)
         for name, extent in record.extents.items():
             try:
                 if short := self._short(replace(record, committed={name: extent.length})):
                     raise short
                 digest = digest_of(self.folder / name, extent.length)
             except StorageError as error:
-                yield str(error)
+                yield error
                 continue
             if digest is None or digest.hexdigest() != extent.sha256:
-                yield f"{name} is not what was committed: its checksum differs"
+                yield DamagedError(f"{name} is not what was committed: its checksum differs")
         if self.spec_path.name in record.committed:
             try:
                 self._read_spec()
             except StorageError as error:
-                yield str(error)
+                yield error
         paths = {path.name: path for path in self.checkpoints()}
         if record.checkpoint and (record.status.is_finished or not self.is_local_copy):
             paths[record.checkpoint] = self.checkpoints_folder / record.checkpoint
@@ -187,23 +197,26 @@ class TrialReader(TrialFiles):
             try:
                 self.load_checkpoint(path)
             except (CheckpointError, StorageError) as error:
-                yield str(error).removeprefix(f"{self.folder}/")
+                kind = type(error) if isinstance(error, StorageError) else DamagedError
+                yield kind(str(error).removeprefix(f"{self.folder}/"))
 
     def verified_record(self) -> TrialRecord:
         """Return ``record``, after a check of every file's digest."""
         record = self.record()
-        found = self.damages() if record.status is not TrialStatus.DAMAGED else []
-        return self._damaged(record, DamagedError(found[0])) if found else record
+        found = self._problems() if record.status is not TrialStatus.DAMAGED else []
+        return self._damaged(record, found[0]) if found else record
 
     def require_whole(self) -> None:
         """Check every file against its committed digest.
 
         Raises:
             DamagedError: a file is damaged; the sentence names it and the remedy.
+            StorageError: a file cannot be read at present; likewise.
         """
         record = self.verified_record()
         if record.status is TrialStatus.DAMAGED:
-            raise DamagedError(f"{self.title}: {record.error}")
+            kind = StorageError if record.is_unreadable else DamagedError
+            raise kind(f"{self.title}: {record.error}")
 
     def committed_bytes(self, path: Path) -> bytes:
         """Read the committed bytes of one of the trial's files; empty if nothing is committed.
@@ -230,7 +243,7 @@ class TrialReader(TrialFiles):
     def episodes(self) -> pd.DataFrame:
         """Read the committed episodes: EPISODE_COLUMNS, then cost_i and limit_i for each cost.
 
-        This and the other readers raise DamagedError if a file differs from its commit.
+        This and the other readers raise the errors of ``committed_bytes``.
         """
         return self._committed_csv(self.episodes_path)
 

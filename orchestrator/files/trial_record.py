@@ -9,6 +9,8 @@ from typing import Any
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.spec import TrialStatus
 
+NOT_STORED = ("is_left_alone", "is_unreadable")
+
 
 @dataclass(frozen=True)
 class TrialRecord:
@@ -35,6 +37,7 @@ class TrialRecord:
             or None.
         error: one line with the reason of a failure or the damage, or empty.
         is_left_alone: whether a damaged trial runs again only on request; not stored.
+        is_unreadable: whether its files cannot be read at present, which is no damage; not stored.
     """
 
     status: TrialStatus = TrialStatus.WAITING
@@ -56,6 +59,7 @@ class TrialRecord:
     start_limits: list[float | str] | None = None
     error: str = ""
     is_left_alone: bool = False
+    is_unreadable: bool = False
 
     @property
     def extents(self) -> dict[str, Extent]:
@@ -64,7 +68,7 @@ class TrialRecord:
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as JSON values; ``from_json`` is its inverse."""
-        return {name: value for name, value in asdict(self).items() if name != "is_left_alone"}
+        return {name: value for name, value in asdict(self).items() if name not in NOT_STORED}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> TrialRecord:

@@ -18,7 +18,7 @@ def environment(changes: Mapping[str, str]) -> Iterator[None]:
         yield
     finally:  # variable by variable, because other threads read the environment
         for name in os.environ.keys() - before.keys():
-            del os.environ[name]
+            os.environ.pop(name, None)
         for name, value in before.items():
             if os.environ.get(name) != value:
                 os.environ[name] = value

@@ -43,7 +43,7 @@ class FinalOutcome:
         is_feasible: whether every cost is within its limit and the tolerance.
         is_solved: whether it is also near a known optimum.
         exact: whether the values were computed, not sampled.
-        excesses: how far each cost is above its limit; 0 where it is within the tolerance, [k].
+        excesses: how far each cost is above its limit; 0 within the tolerance or if it is missing, [k].
         cpu_seconds: CPU time of the trial, which differs from that of an earlier run; None if not known.
     """
 

@@ -46,7 +46,7 @@ class SyncReport:
 
     Attributes:
         trials: trials that have begun.
-        behind: begun trials that are not up to date in MLflow.
+        behind: begun trials that are not up to date in MLflow. A damaged one is, once its run is FAILED.
         points: points sent.
         problem: one line on why MLflow is not up to date, or empty.
         is_broken_off: whether the problem is of MLflow or of the pass, and not of a trial's files.
@@ -118,7 +118,7 @@ class Tracker:
         trials = [trial for trial in self.store.trials() if _has_begun(trial.record())]
         points: list[int] = []  # of each trial that is shown
         problems: list[str] = []
-        unreadable: list[str] = []  # trials whose files are damaged
+        unreadable: list[str] = []  # why files of trials cannot be used
         remark = ""
         with exclusive(self.store, self.uri):
             view, self._view = self._view, None  # made anew after any error

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
@@ -61,7 +62,8 @@ class TrialSync:
         """
         record = trial.record()
         if record.status is TrialStatus.DAMAGED:
-            self._show_damaged(trial, record)
+            if record.is_unreadable or not self._show_damaged(trial, record):
+                raise StorageError(f"{trial.folder.name}: {record.error}")
             return 0
         outcome = self._outcomes.of(trial.spec, record)
         status = trial_run_status(record, live=live, silence_seconds=silence_seconds)
@@ -82,24 +84,38 @@ class TrialSync:
         self._save(trial, replace(position, shown=shown))
         return len(new_points)
 
-    def _show_damaged(self, trial: TrialStore, record: TrialRecord) -> None:
-        """Give the run of a damaged trial its state and the error; its points stay as they are."""
+    def _show_damaged(self, trial: TrialStore, record: TrialRecord) -> bool:
+        """Give the run of a damaged trial its state and the error; its points stay, its outcome goes.
+
+        Returns:
+            Whether it has a run; none is made, because its parameters may be damaged, too.
+        """
         from mlflow.entities import RunTag  # noqa: PLC0415
 
-        position = self._position(trial, record)
+        position = self._positions.get(trial.folder.name) or read_position(self._path(trial))
+        if position is None or position.run_id != self._runs.of_trial(trial.trial_id):
+            return False
         shown = {"status": "FAILED", "attempt": record.attempt, "error": record.error}
         if position.shown != shown:
+            client, run_id = self._runs.client, position.run_id
             tags = [RunTag(key, value) for key, value in state_tags(record).items()]
-            self._runs.client.log_batch(position.run_id, tags=tags)
-            self._runs.set_status(position.run_id, "FAILED", record.heartbeat or time.time())
-            self._save(trial, replace(position, shown=shown))
+            client.log_batch(run_id, tags=tags)
+            for name in {"recrl.verdict", "mlflow.note.content"} & client.get_run(run_id).data.tags.keys():
+                client.delete_tag(run_id, name)
+            self._runs.set_status(run_id, "FAILED", record.heartbeat or time.time())
+            position = replace(position, shown=shown, summary={})
+        self._save(trial, position)
+        return True
 
     def summary(self, trial: TrialStore) -> Summary | None:
         """Return the final means of a complete trial, None before its end."""
         position = self._positions.get(trial.folder.name)
         if position is None or not position.summary:
             return None
-        spec = trial.spec
+        try:
+            spec = trial.spec
+        except StorageError:  # damaged since it was shown
+            return None
         return Summary((spec.task.label, spec.agent.label, spec.method.label), position.summary)
 
     def _send(

@@ -20,7 +20,7 @@ import numpy as np
 
 from recrl._results import Policy, following, load_sweep, policy_of
 from recrl.environments.plugins import modules_here
-from recrl.orchestrator.errors import NO_PATH, NO_ROOM, GridError, RecrlError, StorageError
+from recrl.orchestrator.errors import NO_PATH, NO_ROOM, GridError, RecrlError, StorageError, described
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
@@ -161,6 +161,10 @@ class _PlanWarnings(LaunchListener):
         sentences = (*grid_warnings(self._grid, plan.to_do), *plan.code_warnings, left_out_sentence(plan))
         _warn(filter(None, sentences))
         return nullcontext()
+
+    def failed_to_draw(self, error: Exception) -> None:
+        """Warn of figures that could not be drawn."""
+        _warn([f"not all figures are drawn ({described(error)})"])
 
 
 def _warn(sentences: Iterable[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import re
 from functools import partial
 from typing import Any, ClassVar
 
@@ -372,6 +373,27 @@ def test_an_id_with_a_module_in_front_imports_it_first(identifier: str) -> None:
         1,
     )
     environments.close()
+
+
+@pytest.mark.parametrize(
+    ("keywords", "sentence"),
+    [
+        ({"sutton_barto_rewards": True}, "takes no keyword 'sutton_barto_rewards'; did you mean "),
+        ({"disable_env_checker": True}, "keywords: disable_env_checker is given by recrl; leave it out"),
+    ],
+)
+def test_keywords_of_an_id_are_checked(keywords: dict[str, Any], sentence: str) -> None:
+    options = {"id": "CartPole-v1", "costless": True, "keywords": keywords}
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        make_vector("gymnasium", 1, options=options)
+
+
+def test_keywords_of_gymnasium_and_of_the_class_are_passed_on() -> None:
+    keywords = {"sutton_barto_reward": True, "max_episode_steps": 7}
+    options = {"id": "CartPole-v1", "costless": True, "keywords": keywords}
+    made = make_vector("gymnasium", 1, options=options)
+    assert made.cmdp.horizon == 7
+    made.close()
 
 
 @pytest.mark.parametrize(

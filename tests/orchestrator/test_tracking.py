@@ -520,6 +520,44 @@ def test_a_damaged_trial_is_failed_and_the_others_go_on(
     assert (mended.info.status, mended.data.tags.get("recrl.error")) == ("FINISHED", None)
 
 
+def test_a_trial_that_is_damaged_before_it_is_shown_gets_its_params_when_mended(
+    write: Callable[..., SweepStore],
+) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    trial = trial_titled(store, NONE)
+    whole = trial.episodes_path.read_bytes()
+    trial.episodes_path.write_bytes(whole[:-9])
+    report = sync(store, uri)
+    assert (report.behind, report.is_broken_off) == (1, False)
+    assert NONE not in runs(store)
+    trial.episodes_path.write_bytes(whole)
+    assert sync(store, uri).is_up_to_date
+    assert runs(store)[NONE].data.params.keys() == runs(store)[DYNAMIC].data.params.keys()
+
+
+def test_a_damaged_spec_takes_the_outcome_from_its_run_and_from_the_note(
+    write: Callable[..., SweepStore],
+) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    write_outcomes(store)
+    assert sync(store, uri).is_up_to_date
+    trial = trial_titled(store, NONE)
+    whole = trial.spec_path.read_bytes()
+    trial.spec_path.write_bytes(whole[:-9])
+    damaged = SweepStore(store.folder.parent, store.name)
+    assert sync(damaged, uri).is_up_to_date
+    shown = runs(store)[NONE]
+    assert shown.info.status == "FAILED"
+    assert not {"recrl.verdict", "mlflow.note.content"} & shown.data.tags.keys()
+    note = runs(store)["made-up"].data.tags["mlflow.note.content"]
+    assert "1 damaged" in note
+    trial.spec_path.write_bytes(whole)
+    assert sync(SweepStore(store.folder.parent, store.name), uri).is_up_to_date
+    assert runs(store)[NONE].data.tags["recrl.verdict"] == "solved"
+
+
 def test_rows_that_changed_in_a_byte_break_no_pass_off(write: Callable[..., SweepStore]) -> None:
     store = write()
     path = trial_titled(store, NONE).updates_path

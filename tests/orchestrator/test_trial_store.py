@@ -106,6 +106,10 @@ def test_what_cannot_be_read_for_a_moment_is_not_taken_for_damaged(
             with pytest.raises(StorageError, match=re.escape(os.strerror(code))) as found:
                 store.episodes()
             assert not isinstance(found.value, DamagedError)
+            with pytest.raises(StorageError, match="; try again when the disk can be read") as found:
+                store.require_whole()
+            assert not isinstance(found.value, DamagedError)
+            assert store.verified_record().is_unreadable
     assert {path: path.read_bytes() for path in before} == before
     np.testing.assert_equal(store.begin(SPEC).restore(), tree(2))
 
