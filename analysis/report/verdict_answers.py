@@ -198,6 +198,8 @@ def _policies(count: int) -> str:
 
 
 def _range(rows: pd.DataFrame, i: str) -> str:
-    """Format the least and the largest excess of cost i."""
+    """Format the least and the largest excess of cost i; that of a missing cost is not known."""
+    if rows[f"excess_{i}_high"].isna().all():
+        return "an unknown amount"
     low, high = number(float(rows[f"excess_{i}_low"].min())), number(float(rows[f"excess_{i}_high"].max()))
     return low if low == high else f"{low} to {high}"

@@ -104,10 +104,10 @@ def test_a_cost_within_its_tolerance_is_not_exceeded_and_a_limit_of_0_has_no_sha
 
 def test_a_missing_cost_is_infeasible_by_an_unknown_amount() -> None:
     (sentence,) = answers(judged([outcome("none", seed, 9.5, math.nan) for seed in range(2)]))
-    assert sentence.endswith("'none' exceeds the limit of 5 by – (2 of 2 policies).")
+    assert sentence.endswith("'none' exceeds the limit of 5 by an unknown amount (2 of 2 policies).")
     others = {"cost_1": math.nan, "deploy_limit_1": 1.0, "feasible": False, "optimal": False}
     table = judged([outcome("none", seed, 9.5, 5.0, **others) for seed in range(2)])
-    assert verdict_text(table.iloc[0]) == "infeasible: by –"
+    assert verdict_text(table.iloc[0]) == "infeasible: by an unknown amount"
     assert answers(table)[0].endswith("'none' exceeds a limit (2 of 2 policies): –.")
 
 
