@@ -375,3 +375,8 @@ def test_a_launch_films_what_the_grid_wants(
     assert "__s3__" in video.parts[-3]
     assert main(launch) == ExitCode.OK
     assert "Videos" not in capsys.readouterr().out
+    video.rename(
+        video.with_name(video.name.replace("update-00000001", "update-00000000"))
+    )  # an earlier policy
+    assert main(launch) == ExitCode.OK
+    assert video.exists()

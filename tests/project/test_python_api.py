@@ -120,6 +120,17 @@ def test_training_equals_the_sweeps_trial(folder: Path) -> None:
     assert again.updates.equals(one.updates)
 
 
+def test_figures_that_cannot_be_drawn_are_a_warning(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("recrl.analysis.report.drawing.draw", full)
+    with pytest.warns(
+        UserWarning, match=r"not all figures are drawn \(OSError: .* No space left on device\)"
+    ):
+        recrl.launch(GRID, executor="inline", mlflow=False, progress=False)
+
+
 def test_progress_is_plain_lines_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     train(progress=True, total_steps=1200)
     lines = capsys.readouterr().err.splitlines()
