@@ -73,6 +73,13 @@ class SweepBusyError(RecrlError):
     """Another process is running this sweep."""
 
 
+class ProcessTerminatedError(SystemExit):
+    """This process was told to end by SIGTERM, for example because its node is taken away.
+
+    It is no error of the user's code: the trial waits, and continues from its last commit.
+    """
+
+
 class TeacherUnavailableError(RecrlError):
     """The teacher did not answer; nothing is lost, the trial can be resumed."""
 

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import json
 import logging
+import signal
 from collections.abc import Mapping
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import ray
 from ray import tune
 
-from recrl.orchestrator.errors import DamagedError
+from recrl.orchestrator.errors import DamagedError, ProcessTerminatedError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.ray.teacher_service import RayTeacher, find_teacher_service
 from recrl.orchestrator.remote.remote_sweep import sweep_place
@@ -33,6 +35,8 @@ class TuneTrial(tune.Trainable):
 
     def setup(self, config: dict[str, Any]) -> None:
         """Prepare for the first trial."""
+        if ray.is_initialized() and ray.get_runtime_context().get_actor_id() is not None:
+            signal.signal(signal.SIGTERM, _end_process)  # Ray's own handler raises a plain SystemExit
         self._take(config)
 
     def reset_config(self, new_config: dict[str, Any]) -> bool:
@@ -72,6 +76,11 @@ class TuneTrial(tune.Trainable):
         self._commit_seconds: float = config["commit_seconds"]
         name = config["teacher_service"]
         self._teacher = RayTeacher(self._spec.teacher, find_teacher_service(name)) if name else None
+
+
+def _end_process(number: int, frame: FrameType | None) -> None:
+    """End this worker process; its trial waits to be resumed."""
+    raise ProcessTerminatedError(1)
 
 
 def spec_of(trial: Any) -> TrialSpec:

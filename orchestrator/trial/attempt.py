@@ -14,6 +14,7 @@ from recrl.agents.evaluation import StoppedError
 from recrl.orchestrator.errors import (
     USERS_ERRORS,
     LostLeaseError,
+    ProcessTerminatedError,
     StorageError,
     TeacherUnavailableError,
     described,
@@ -163,6 +164,7 @@ def run_recorded(
 
     Raises:
         TeacherUnavailableError: the teacher does not answer; the trial waits to be resumed.
+        ProcessTerminatedError: the process was told to end; likewise.
     """
     provenance = {
         **collect_provenance(),
@@ -196,6 +198,10 @@ def run_recorded(
         except USERS_ERRORS as error:
             if isinstance(error, SystemExit) and should_stop():  # a second signal to a stopping worker
                 return _close(writer, TrialStatus.WAITING)
+            if isinstance(error, ProcessTerminatedError):
+                logger.warning("the process was told to end (SIGTERM); the trial waits to be resumed")
+                _close(writer, TrialStatus.WAITING)
+                raise
             logger.exception("failed; rows and checkpoint end at the last commit")
             notes = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
             text = shown(f"{described(error)}{notes}")

@@ -48,6 +48,20 @@ def running_trial(store: SweepStore) -> int:
     raise AssertionError("no trial began within two minutes")
 
 
+def test_a_worker_that_is_told_to_end_is_no_failure(tmp_path: Path) -> None:
+    """As by a batch system that takes a node away."""
+    (tmp_path / "grid.yaml").write_text(GRID)
+    store = SweepStore(tmp_path / "runs", "bereft")
+    driver = launch(tmp_path)
+    os.kill(running_trial(store), signal.SIGTERM)
+    _, errors = driver.communicate(timeout=300.0)
+    assert driver.returncode == 0, errors
+    [trial] = store.trials()
+    record = trial.record()
+    assert (record.status, record.attempt) == (TrialStatus.COMPLETE, 2)
+    assert not trial.error_path.exists()
+
+
 @pytest.mark.parametrize(
     ("title", "said"),
     [

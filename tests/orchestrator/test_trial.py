@@ -24,6 +24,7 @@ from recrl.agents.registry import AGENTS, make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
 from recrl.environments.vector import CMDPVectorEnv
+from recrl.orchestrator.errors import ProcessTerminatedError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
@@ -442,6 +443,20 @@ def test_a_stopping_worker_that_is_ended_by_a_second_signal_waits(
     monkeypatch.setattr(Trial, "advance", advance)
     store = SweepStore(tmp_path, "sweep").trial(SPEC)
     assert run_recorded(SPEC, store, should_stop=lambda: bool(stopping)) is TrialStatus.WAITING
+
+
+def test_a_process_that_is_told_to_end_leaves_its_trial_waiting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: TrialStore
+) -> None:
+    store = SweepStore(tmp_path, "sweep").trial(SPEC)
+    with monkeypatch.context() as ended:
+        ended.setattr(Trial, "advance", Mock(side_effect=ProcessTerminatedError(1)))
+        with pytest.raises(ProcessTerminatedError):
+            run_recorded(SPEC, store, should_stop=never)
+    record = store.record()
+    assert (record.status, record.error, store.error_path.exists()) == (TrialStatus.WAITING, "", False)
+    assert run_recorded(SPEC, store, should_stop=never) is TrialStatus.COMPLETE
+    assert store.evaluation_path.read_bytes() == undisturbed.evaluation_path.read_bytes()
 
 
 @pytest.mark.parametrize("failing", [False, True])
