@@ -74,7 +74,7 @@ class SweepBusyError(RecrlError):
 
 
 class ProcessTerminatedError(SystemExit):
-    """This process was told to end by SIGTERM, for example because its node is taken away.
+    """SIGTERM ends this process, for example because its node is taken away.
 
     It is no error of the user's code: the trial waits, and continues from its last commit.
     """

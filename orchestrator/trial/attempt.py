@@ -164,7 +164,7 @@ def run_recorded(
 
     Raises:
         TeacherUnavailableError: the teacher does not answer; the trial waits to be resumed.
-        ProcessTerminatedError: the process was told to end; likewise.
+        ProcessTerminatedError: the process got SIGTERM; likewise.
     """
     provenance = {
         **collect_provenance(),
@@ -199,7 +199,7 @@ def run_recorded(
             if isinstance(error, SystemExit) and should_stop():  # a second signal to a stopping worker
                 return _close(writer, TrialStatus.WAITING)
             if isinstance(error, ProcessTerminatedError):
-                logger.warning("the process was told to end (SIGTERM); the trial waits to be resumed")
+                logger.warning("the process got SIGTERM; the trial waits to be resumed")
                 _close(writer, TrialStatus.WAITING)
                 raise
             logger.exception("failed; rows and checkpoint end at the last commit")

@@ -48,7 +48,7 @@ def running_trial(store: SweepStore) -> int:
     raise AssertionError("no trial began within two minutes")
 
 
-def test_a_worker_that_is_told_to_end_is_no_failure(tmp_path: Path) -> None:
+def test_a_worker_that_gets_sigterm_is_no_failure(tmp_path: Path) -> None:
     """As by a batch system that takes a node away."""
     (tmp_path / "grid.yaml").write_text(GRID)
     store = SweepStore(tmp_path / "runs", "bereft")

@@ -445,7 +445,7 @@ def test_a_stopping_worker_that_is_ended_by_a_second_signal_waits(
     assert run_recorded(SPEC, store, should_stop=lambda: bool(stopping)) is TrialStatus.WAITING
 
 
-def test_a_process_that_is_told_to_end_leaves_its_trial_waiting(
+def test_a_process_that_gets_sigterm_leaves_its_trial_waiting(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: TrialStore
 ) -> None:
     store = SweepStore(tmp_path, "sweep").trial(SPEC)
