@@ -64,8 +64,8 @@ def _gain_text(row: pd.Series) -> str:
 def verdict_kinds(verdicts: pd.DataFrame) -> list[str]:
     """Return the kind of each row.
 
-    It is INFEASIBLE or FAILED if any trial is, PENDING without a final policy, SOLVED if all trials are, else
-    FEASIBLE.
+    It is INFEASIBLE or FAILED if any trial is. Without a final policy it is PENDING, or UNEVALUATED if all
+    trials are complete. It is SOLVED if all trials are, else FEASIBLE.
 
     Args:
         verdicts: of ``verdict_counts.count_verdicts``.

@@ -103,8 +103,7 @@ class TrialSync:
             for name in {"recrl.verdict", "mlflow.note.content"} & client.get_run(run_id).data.tags.keys():
                 client.delete_tag(run_id, name)
             self._runs.set_status(run_id, "FAILED", record.heartbeat or time.time())
-            position = replace(position, shown=shown, summary={})
-        self._save(trial, position)
+            self._save(trial, replace(position, shown=shown, summary={}))
         return True
 
     def summary(self, trial: TrialStore) -> Summary | None:

@@ -262,6 +262,8 @@ def test_an_incomplete_sweep_says_so_and_counts_what_waits_neither_way() -> None
     assert '<tr class="no-result-yet">' in html
     table = judged(ROWS[4:6], waiting=pending[:1], failed=pending[1:])
     assert verdict_kinds(table) == ["solved", "failed"]
+    table = judged(ROWS[4:6], complete=pending)  # without evaluation episodes
+    assert verdict_kinds(table) == ["solved", "not evaluated"]
 
 
 @pytest.mark.parametrize(

@@ -387,14 +387,14 @@ def test_workers_hear_of_the_end_of_their_own_run_and_of_all_earlier_ones(
     objects = ObjectStore(f"unreliable://{tmp_path}/bucket/small")
     with StopObject.open(objects) as earlier:
         assert not StopObject(objects, earlier.place).is_set()
-        with StopObject.open(objects) as sign:
+        with StopObject.open(objects) as made:
             assert StopObject(objects, earlier.place).is_set()
-            worker = StopObject(objects, sign.place)
+            worker = StopObject(objects, made.place)
             assert not worker.is_set()
             Unreliable.plan.append("refused")
-            sign.set()
-            assert not sign.is_set()
-            sign.set()
+            made.set()
+            assert not made.is_set()
+            made.set()
             assert not worker.is_set()  # it asked a moment ago
             monkeypatch.setattr(StopObject, "poll_seconds", 0.0)
             assert worker.is_set()
