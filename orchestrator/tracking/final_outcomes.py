@@ -9,17 +9,14 @@ complete trial is not in it.
 from __future__ import annotations
 
 import csv
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from recrl.orchestrator.files.outcomes_file import (
-    FAILED,
     FEASIBLE,
     INFEASIBLE,
     OUTCOMES_FILE,
-    PENDING,
     SOLVED,
     VERDICT_MEASURE,
 )
@@ -27,7 +24,6 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.tracking.positions import file_mark
-from recrl.orchestrator.tracking.run_content import table_line
 
 
 @dataclass(frozen=True)
@@ -36,7 +32,6 @@ class FinalOutcome:
 
     Attributes:
         trial_id: of the trial.
-        group: labels of task, agent and curriculum.
         episode_return: exact where ``exact``, else a mean over episodes.
         costs: episode costs, likewise, [k].
         limits: d_d, [k].
@@ -48,7 +43,6 @@ class FinalOutcome:
     """
 
     trial_id: str
-    group: tuple[str, str, str]
     episode_return: float
     costs: tuple[float, ...]
     limits: tuple[float, ...]
@@ -99,19 +93,6 @@ class FinalOutcomes:
         is_of_this_run = found.cpu_seconds is None or found.cpu_seconds == record.cpu_seconds
         return found if is_of_this_run else None
 
-    def of_grid(
-        self, specs: Sequence[TrialSpec], records: Mapping[str, TrialRecord]
-    ) -> Sequence[FinalOutcome]:
-        """Return the outcomes of a grid's complete trials, in the report's order.
-
-        Args:
-            specs: the trials of the grid.
-            records: of these trials, by folder name.
-        """
-        self._refresh()
-        known = {it.trial_id for it in specs if self.of(it, records[it.folder_name]) is not None}
-        return [outcome for trial_id, outcome in self._found.items() if trial_id in known]
-
     def lack_a_complete_trial(self) -> bool:
         """Whether a complete trial of the grid, whose policy was evaluated, is not in the file."""
         evaluated = (spec for spec in self._store.specs() if spec.evaluation_episodes)
@@ -150,9 +131,10 @@ def trial_note(outcome: FinalOutcome, start_limits: Sequence[float]) -> str:
         start_limits: the d_t that its curriculum began with, [k].
     """
     how = "computed exactly" if outcome.exact else "means over sampled episodes"
+    verdict = f"{outcome.verdict}{_by(outcome.excesses)}"
     costs = _listed(outcome.costs, digits=3)
     return (
-        f"**{outcome.verdict}{_by([outcome])}**: return {_text(outcome.episode_return)}, cost {costs}, "
+        f"**{verdict}**: return {_text(outcome.episode_return)}, cost {costs}, "
         f"limit d_d {_listed(outcome.limits)}, training limit d_t {_listed(start_limits)}.\n\n"
         f"These are the metrics `final/...` of the final policy (stochastic, without learning), {how}, as in "
         "the report. `evaluation/...` are means over sampled episodes of the same policy. "
@@ -160,60 +142,14 @@ def trial_note(outcome: FinalOutcome, start_limits: Sequence[float]) -> str:
     )
 
 
-def verdict_lines(
-    outcomes: Sequence[FinalOutcome], states: Mapping[tuple[str, str, str], Sequence[TrialStatus]]
-) -> list[str]:
-    """Return the table of verdicts in Markdown, one row per task, agent and curriculum.
+def _by(excesses: Sequence[float]) -> str:
+    """Return the excess of each exceeded cost; empty if there is none.
 
-    Args:
-        outcomes: of the grid's complete trials.
-        states: of all trials of the grid, by group.
+    One cost: `` by 0.28``. Several: ``, cost 0 by 0.50, cost 1 by 0.25``.
     """
-    if not outcomes:
-        return []
-    groups: dict[tuple[str, str, str], list[FinalOutcome]] = {group: [] for group in states}
-    for outcome in outcomes:
-        groups[outcome.group].append(outcome)
-    heads = ("task", "agent", "curriculum", "verdict", "cost", "limit", "return", "n")
-    lines = [table_line(heads), "|" + " --- |" * len(heads)]
-    for group, seeds in groups.items():
-        costs = [_mean(values) for values in zip(*(it.costs for it in seeds), strict=True)]
-        verdicts = _verdicts(seeds, states[group])
-        cells = (verdicts, _listed(costs, digits=3), _listed(seeds[0].limits if seeds else ()))
-        earned = _text(_mean([it.episode_return for it in seeds])) if seeds else ""
-        lines.append(table_line([*group, *cells, earned, str(len(seeds))]))
-    return lines
-
-
-def _verdicts(seeds: Sequence[FinalOutcome], states: Sequence[TrialStatus]) -> str:
-    """Count a group's verdicts: ``solved 2 of 5; infeasible 2 of 5 by up to 0.28; failed 1 of 5``."""
-    failed = states.count(TrialStatus.FAILED)
-    total = len(states)
-    parts = []
-    for verdict in (SOLVED, FEASIBLE, INFEASIBLE):
-        chosen = [it for it in seeds if it.verdict == verdict]
-        if chosen:
-            count = f" {len(chosen)} of {total}" if len(chosen) < total else ""
-            parts.append(f"{verdict}{count}{_by(chosen)}")
-    without = {FAILED: failed, PENDING: total - len(seeds) - failed}
-    for name, number in without.items():
-        if number > 0:
-            parts.append(f"{name} {number} of {total}" if number < total else name)
-    return "; ".join(parts)
-
-
-def _by(outcomes: Sequence[FinalOutcome]) -> str:
-    """Return the largest excess of each exceeded cost of some policies; empty if they are feasible.
-
-    One cost: `` by up to 0.28``. Several: ``, cost 0 by up to 0.50, cost 1 by up to 0.25``.
-    """
-    largest = [max(values) for values in zip(*(it.excesses for it in outcomes), strict=True)]
-    by = "by up to" if len(outcomes) > 1 else "by"
-    return "".join(
-        f"{f', cost {i}' if len(largest) > 1 else ''} {by} {_text(excess)}"
-        for i, excess in enumerate(largest)
-        if excess > 0.0
-    )
+    names = [f", cost {i}" for i in range(len(excesses))] if len(excesses) > 1 else [""]
+    by = zip(names, excesses, strict=True)
+    return "".join(f"{name} by {_text(excess)}" for name, excess in by if excess > 0.0)
 
 
 def _outcome(row: Mapping[str, str]) -> FinalOutcome:
@@ -221,7 +157,6 @@ def _outcome(row: Mapping[str, str]) -> FinalOutcome:
     costs = sorted(names, key=lambda name: int(name.removeprefix("cost_")))
     return FinalOutcome(
         trial_id=row["trial_id"],
-        group=(row["task"], row["agent"], row["method"]),
         episode_return=float(row["episode_return"]),
         costs=tuple(float(row[name]) for name in costs),
         limits=tuple(float(row[f"deploy_limit_{name.removeprefix('cost_')}"]) for name in costs),
@@ -231,10 +166,6 @@ def _outcome(row: Mapping[str, str]) -> FinalOutcome:
         excesses=tuple(float(row[f"excess_{name.removeprefix('cost_')}"] or 0.0) for name in costs),
         cpu_seconds=float(row["cpu_seconds"]) if row.get("cpu_seconds") else None,
     )
-
-
-def _mean(values: Sequence[float]) -> float:
-    return math.fsum(values) / len(values)
 
 
 def _listed(values: Sequence[float], *, digits: int = 2) -> str:

@@ -165,9 +165,8 @@ class _View:
             folder = sync_folder(store, uri)
             for path in (folder / "sweep.json", *folder.glob("trial-*.json")):
                 path.unlink(missing_ok=True)
-        outcomes = FinalOutcomes(store)
-        self.trials = TrialSync(store, uri, self.runs, outcomes)
-        self.sweep = SweepSync(store, uri, self.runs, self.trials.summary, write_export, outcomes=outcomes)
+        self.trials = TrialSync(store, uri, self.runs, FinalOutcomes(store))
+        self.sweep = SweepSync(store, uri, self.runs, write_export)
 
 
 @contextmanager

@@ -30,7 +30,6 @@ class Position:
         last_row: that row; if the file differs, it was truncated and written again.
         shown: content of the run besides points: status, attempt, error and so on.
         artifacts: ``file_mark`` of each file sent, by its place among the run's artifacts.
-        summary: the final means of a complete trial.
     """
 
     run_id: str
@@ -38,7 +37,6 @@ class Position:
     last_row: str = ""
     shown: Mapping[str, Any] = field(default_factory=dict)
     artifacts: Mapping[str, str] = field(default_factory=dict)
-    summary: Mapping[str, float] = field(default_factory=dict)
 
     def fits(self, data: bytes) -> bool:
         """Return whether the committed rows are still the sent ones."""
@@ -55,7 +53,7 @@ def read_position(path: Path) -> Position | None:
         position = Position(**json.loads(path.read_text()))
     except (OSError, ValueError, TypeError):
         return None
-    kinds = (str, int, str, dict, dict, dict)
+    kinds = (str, int, str, dict, dict)
     values = (getattr(position, name) for name in Position.__dataclass_fields__)
     return position if all(map(isinstance, values, kinds)) else None
 

@@ -31,7 +31,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 
@@ -44,7 +44,6 @@ from recrl.orchestrator.spec import TrialSpec
 POINTS_PER_METRIC = 100
 MAX_PARAMS = 100  # in one request
 MAX_NOTE = 7_500  # characters; MLflow takes 8,000 in a tag
-MAX_VERDICTS = 5_000  # of them, for the table of verdicts
 
 GROUP_TAG = "recrl.group"
 
@@ -187,82 +186,34 @@ def group_tag(spec: TrialSpec, *, is_in_grid: bool) -> str:
     return group if is_in_grid else f"{group}, no longer in the grid"
 
 
-@dataclass(frozen=True)
-class Summary:
-    """Entry of a sweep's note for one complete trial.
-
-    Attributes:
-        group: labels of task, agent and method.
-        values: ``summary/...`` by name.
-    """
-
-    group: tuple[str, str, str]
-    values: Mapping[str, float]
-
-
 def report_page(experiment_id: str, run_id: str) -> str:
     """Return the address of the report among a run's artifacts, after the ``#`` of the UI's address."""
     return f"/experiments/{experiment_id}/runs/{run_id}/artifacts/figures/report.html"
 
 
-def note(
-    name: str,
-    counts: Mapping[str, int],
-    complete: Sequence[Summary],
-    *,
-    charts: str,
-    verdicts: Sequence[str] = (),
-    report: str = "",
-) -> str:
-    """Return the sweep's note in Markdown: verdicts, progress, and a row for each group with complete trials.
+def note(name: str, counts: Mapping[str, int], *, charts: str, report: str, report_text: str) -> str:
+    """Return the sweep's note in Markdown: progress, links, and the first part of the report.
 
     Args:
         name: the sweep.
         counts: number of trials by status: complete, running, ...
-        complete: one for each complete trial.
         charts: address of the page of charts.
-        verdicts: lines of the table of verdicts; empty before the report is drawn.
-        report: address of the report, or empty.
+        report: address of the report.
+        report_text: the report as Markdown; empty before it is drawn. Its first part, before any section,
+            has the answers and the verdicts.
     """
     total = sum(counts.values())
     states = ", ".join(f"{count} {state}" for state, count in counts.items() if count) or "none yet"
-    kept = list(verdicts)
-    while sum(map(len, kept)) + len(kept) > MAX_VERDICTS:
-        kept.pop()
-    cut = ["", "More verdicts than fit here: see the report."] if len(kept) < len(verdicts) else []
-    linked = [f"[Report]({report})", ""] if report else []
-    head = ["**Final policies** (stochastic, without learning), as in the report:", ""] if kept else []
-    lines = [*head, *kept, *cut, *([""] if kept else []), *linked]
-    lines.append(
-        f"**{name}**: {total} trials ({states}). [Charts, seeds averaged]({charts}); "
-        "the figures are artifacts of this run."
-    )
-    names = sorted({value.removeprefix("summary/") for trial in complete for value in trial.values})
-    if names:
-        heads = ["task", "agent", "curriculum", "n", *(value.replace("_", " ") for value in names)]
-        lines += ["", "**Deployment phase**, in which learning goes on: means over complete trials.", ""]
-        lines += [table_line(heads), "|" + " --- |" * len(heads)]
-    for group in sorted({trial.group for trial in complete}):
-        trials = [trial.values for trial in complete if trial.group == group]
-        means = [
-            _mean_text([values[f"summary/{value}"] for values in trials if f"summary/{value}" in values])
-            for value in names
-        ]
-        line = table_line([*group, str(len(trials)), *means])
+    lines = [f"**{name}**: {total} trials ({states}). [Charts, seeds averaged]({charts})."]
+    if report_text:
+        lines += [f"[Report]({report}); its figures are artifacts of this run."]
+    opening = report_text.split("\n## ", 1)[0].splitlines()[1:]  # without the title
+    for line in opening:
         if sum(map(len, lines)) + len(lines) + len(line) > MAX_NOTE:
-            lines += ["", "More groups than fit here: see the table figure."]
+            lines += ["", "More than fits here: see the report."]
             break
         lines.append(line)
     return "\n".join(lines)
-
-
-def table_line(cells: Iterable[str]) -> str:
-    r"""Return a line of a Markdown table; a bar in a cell does not end it.
-
-    >>> table_line(["a|b", "1"])
-    '| a\\|b | 1 |'
-    """
-    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
 
 
 def single_values(values: Mapping[str, float], seconds: float) -> list[Point]:
@@ -292,7 +243,3 @@ def _safe(name: str) -> str:
 def _limit(limit: float) -> str:
     """Return a limit as in a grid, with all its digits: ``0.1234567``, ``25``, ``auto``."""
     return repr(limit).removesuffix(".0") if math.isfinite(limit) else "auto"
-
-
-def _mean_text(values: Sequence[float]) -> str:
-    return f"{sum(values) / len(values):.2f}" if values else ""

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
-from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.sweep_progress import DisplayStatus, display_status, shown_record
 from recrl.orchestrator.tracking.chart_view import charts_page
 from recrl.orchestrator.tracking.export_file import ExportUpload, ExportWriter
-from recrl.orchestrator.tracking.final_outcomes import FinalOutcomes, verdict_lines
 from recrl.orchestrator.tracking.mlflow_runs import SweepRuns
 from recrl.orchestrator.tracking.positions import Position, read_position, sync_folder
-from recrl.orchestrator.tracking.run_content import Summary, note, report_page
+from recrl.orchestrator.tracking.run_content import note, report_page
 from recrl.orchestrator.tracking.run_status import sweep_run_status
 
 
@@ -29,10 +26,7 @@ class SweepSync:
         store: SweepStore,
         uri: str,
         runs: SweepRuns,
-        summary: Callable[[TrialStore], Summary | None],
         write_export: ExportWriter | None,
-        *,
-        outcomes: FinalOutcomes,
     ) -> None:
         """Continue from the position of an earlier process.
 
@@ -40,14 +34,10 @@ class SweepSync:
             store: the sweep.
             uri: of ``client.tracking_uri``.
             runs: its runs.
-            summary: returns the means of a trial that is complete.
             write_export: writes the export file; None to upload none.
-            outcomes: of the final policies.
         """
-        self._outcomes = outcomes
         self._store = store
         self._runs = runs
-        self._summary = summary
         folder = sync_folder(store, uri)
         self._path = folder / "sweep.json"
         known = read_position(self._path)
@@ -60,9 +50,9 @@ class SweepSync:
         Returns:
             The reason why the export file could not be uploaded, or empty.
         """
-        specs = self._store.specs()
-        records = {spec.folder_name: shown_record(self._store.trial(spec)) for spec in specs}
-        position = self._show_state(self._position, specs, records, live=live)
+        trials = map(self._store.trial, self._store.specs())
+        records = {trial.folder.name: shown_record(trial) for trial in trials}
+        position = self._show_state(self._position, records, live=live)
         position = self._runs.send_files(position, [self._store.grid_path, self._store.info_path])
         figures = sorted(self._store.figures_folder.glob("[!.]*"))  # no temporary files
         position = self._runs.send_files(position, figures, "figures")
@@ -73,14 +63,7 @@ class SweepSync:
         self._save(position)
         return remark
 
-    def _show_state(
-        self,
-        position: Position,
-        specs: Sequence[TrialSpec],
-        records: Mapping[str, TrialRecord],
-        *,
-        live: bool,
-    ) -> Position:
+    def _show_state(self, position: Position, records: Mapping[str, TrialRecord], *, live: bool) -> Position:
         from mlflow.entities import RunTag  # noqa: PLC0415
 
         now, silence = time.time(), self._store.silence_seconds
@@ -88,14 +71,12 @@ class SweepSync:
             display_status(record, now=now, silence_seconds=silence) for record in records.values()
         )
         status = sweep_run_status(counts, live=live)
-        summaries = filter(None, map(self._summary, map(self._store.trial, specs)))
         text = note(
             self._store.name,
             {status: counts[status] for status in DisplayStatus},
-            list(summaries),
             charts=f"#{charts_page(self._runs.experiment_id)}",
-            verdicts=verdict_lines(self._outcomes.of_grid(specs, records), _states(specs, records)),
-            report=self._report(),
+            report=f"#{report_page(self._runs.experiment_id, self._runs.parent_id)}",
+            report_text=self._report_text(),
         )
         if position.shown.get("note") != text:
             self._runs.client.log_batch(position.run_id, tags=[RunTag("mlflow.note.content", text)])
@@ -104,24 +85,14 @@ class SweepSync:
             self._runs.set_status(position.run_id, status, last or time.time())
         return replace(position, shown={**position.shown, "note": text, "status": status})
 
-    def _report(self) -> str:
-        """Return the address of the report in MLflow, or empty before it is drawn."""
-        if not (self._store.figures_folder / "report.html").exists():
+    def _report_text(self) -> str:
+        """Return the report as Markdown, or nothing before it is drawn."""
+        try:
+            return (self._store.figures_folder / "report.md").read_text(encoding="utf-8", errors="replace")
+        except FileNotFoundError:
             return ""
-        return f"#{report_page(self._runs.experiment_id, self._runs.parent_id)}"
 
     def _save(self, position: Position) -> None:
         if position != self._position:
             position.write(self._path)
             self._position = position
-
-
-def _states(
-    specs: Sequence[TrialSpec], records: Mapping[str, TrialRecord]
-) -> Mapping[tuple[str, str, str], list[TrialStatus]]:
-    """Return the states of trials by task, agent and curriculum."""
-    states: dict[tuple[str, str, str], list[TrialStatus]] = {}
-    for spec in specs:
-        group = (spec.task.label, spec.agent.label, spec.method.label)
-        states.setdefault(group, []).append(records[spec.folder_name].status)
-    return states

@@ -24,7 +24,6 @@ from recrl.orchestrator.tracking.run_content import (
     GROUP_TAG,
     Point,
     Row,
-    Summary,
     final_points,
     group_tag,
     params,
@@ -103,19 +102,8 @@ class TrialSync:
             for name in {"recrl.verdict", "mlflow.note.content"} & client.get_run(run_id).data.tags.keys():
                 client.delete_tag(run_id, name)
             self._runs.set_status(run_id, "FAILED", record.heartbeat or time.time())
-            self._save(trial, replace(position, shown=shown, summary={}))
+            self._save(trial, replace(position, shown=shown))
         return True
-
-    def summary(self, trial: TrialStore) -> Summary | None:
-        """Return the final means of a complete trial, None before its end."""
-        position = self._positions.get(trial.folder.name)
-        if position is None or not position.summary:
-            return None
-        try:
-            spec = trial.spec
-        except StorageError:  # damaged since it was shown
-            return None
-        return Summary((spec.task.label, spec.agent.label, spec.method.label), position.summary)
 
     def _send(
         self,
@@ -204,8 +192,7 @@ def _points_to_send(
         last = final_points(trial.updates(), trial.evaluation(), row)
         if outcome is not None:
             last += single_values(outcome.metrics, time.time())  # measured again: the newest counts
-        summary = {point.key: point.value for point in last if point.key.startswith("summary/")}
-        found, position = [*found, *last], replace(position, summary=summary)
+        found += last
     return found, position
 
 

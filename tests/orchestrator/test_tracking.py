@@ -39,11 +39,9 @@ from recrl.orchestrator.tracking.final_outcomes import (
     FinalOutcomes,
     _outcome,
     trial_note,
-    verdict_lines,
 )
 from recrl.orchestrator.tracking.mlflow_sync import sync
 from recrl.orchestrator.tracking.run_content import (
-    Summary,
     final_points,
     note,
     params,
@@ -220,27 +218,40 @@ def charts_of(section: str, i: int) -> list[tuple[str, bool]]:
     return [(f"{section}/cost_{i}", False), (f"{section}/limit_{i}", True)]
 
 
-def test_the_note_has_a_line_a_group_with_means_over_seeds() -> None:
-    group = ("river", "cpo", "dynamic")
-    complete = [Summary(group, {"summary/deploy_return": value}) for value in (8.0, 9.0)]
-    text = note("demo", {"complete": 2, "failed": 0, "running": 1}, complete, charts="#/charts")
-    assert text.splitlines()[0].startswith("**demo**: 3 trials (2 complete, 1 running). [Charts")
-    assert text.splitlines()[-1] == "| river | cpo | dynamic | 2 | 8.50 |"
+REPORT = """\
+# demo
+
+- map: 1 of 2 final policies solve it.
+
+| task | agent | verdict |
+| --- | --- | --- |
+| map | cpo | solved 1 of 2 |
+
+## Trials and warnings
+
+2 trials
+"""
 
 
-def test_a_label_with_a_bar_stays_in_its_column() -> None:
-    summary = Summary(("t", "a|b", "m"), {"summary/deploy_return": 1.0})
-    text = note("s", {"complete": 1}, [summary], charts="c")
-    assert r"| t | a\|b | m | 1 | 1.00 |" in text
+def test_the_note_has_the_progress_links_and_what_the_report_begins_with() -> None:
+    counts = {"complete": 2, "failed": 0, "running": 1}
+    text = note("demo", counts, charts="#/charts", report="#/report", report_text=REPORT)
+    assert text.splitlines() == [
+        "**demo**: 3 trials (2 complete, 1 running). [Charts, seeds averaged](#/charts).",
+        "[Report](#/report); its figures are artifacts of this run.",
+        *REPORT.splitlines()[1:7],
+    ]
+    before = note("demo", counts, charts="#/charts", report="#/report", report_text="")
+    assert before.splitlines() == text.splitlines()[:1]
 
 
 def test_a_long_note_is_cut_where_mlflow_would_refuse_it() -> None:
-    complete = [
-        Summary((f"task-{index}", "cpo", "none"), {"summary/deploy_return": 0.0}) for index in range(999)
-    ]
-    text = note("demo", {"complete": 999}, complete, charts="#/charts")
-    assert len(text) < 8000
-    assert text.endswith("More groups than fit here: see the table figure.")
+    rows = "\n".join(f"| task-{index} | cpo | none | solved | 5.00 |" for index in range(999))
+    text = note(
+        "demo", {"complete": 999}, charts="#/charts", report="#/report", report_text=f"# demo\n{rows}"
+    )
+    assert 7000 < len(text) < 8000
+    assert text.endswith("| solved | 5.00 |\n\nMore than fits here: see the report.")
 
 
 def test_params_are_few_and_flat(made_up_sweep: Callable[..., SweepStore]) -> None:
@@ -699,7 +710,7 @@ def test_each_run_has_the_verdict_of_the_report(write: Callable[..., SweepStore]
     sync(store, uri)
     assert "final/return" not in runs(store)[NONE].data.metrics
     write_outcomes(store)
-    (store.figures_folder / "report.html").write_text("<p>")
+    (store.figures_folder / "report.md").write_text("# made-up\n\n- river-a: solved.\n\n## More\n")
     sync(store, uri)
     shown = runs(store)
     parent, run = shown["made-up"], shown[DYNAMIC]
@@ -711,11 +722,9 @@ def test_each_run_has_the_verdict_of_the_report(write: Callable[..., SweepStore]
         "**infeasible by 4.06**: return 15.00, cost 9.062, limit d_d 5.00, training limit d_t 100.00."
     )
     lines = parent.data.tags["mlflow.note.content"].splitlines()
-    assert lines[:2] == ["**Final policies** (stochastic, without learning), as in the report:", ""]
-    assert lines[2].startswith("| task | agent | curriculum | verdict |")
-    assert lines[5] == "| river-a | cpo | dynamic | infeasible by 4.06 | 9.062 | 5.00 | 15.00 | 1 |"
+    assert lines[2:] == ["", "- river-a: solved."]
     page = f"#/experiments/{parent.info.experiment_id}/runs/{parent.info.run_id}/artifacts"
-    assert lines[7] == f"[Report]({page}/figures/report.html)"
+    assert lines[1] == f"[Report]({page}/figures/report.html); its figures are artifacts of this run."
     assert sync(store, uri).points == 0
     sync(store, uri, rebuild=True)
     assert runs(store)[NONE].data.metrics["final/cost_0"] == 5.0
@@ -759,9 +768,6 @@ def test_a_trial_that_ran_again_does_not_keep_the_outcome_of_before(write: Calla
     assert outcomes.of(trial.spec, again) is None
     with trial.locked():
         trial.write_record(again)
-    specs = store.specs()
-    records = {spec.folder_name: store.trial(spec).record() for spec in specs}
-    assert [it.group[2] for it in outcomes.of_grid(specs, records)] == ["none"]
     assert outcomes.lack_a_complete_trial()
 
 
@@ -860,17 +866,11 @@ def test_sync_rebuilds_what_mlflow_shows(
 
 def test_the_verdict_names_every_cost_above_its_limit() -> None:
     """Cost 1 of the first policy is within its tolerance."""
-    group = ("map", "cpo", "none")
     costs, limits = (5.5, 1050.0), (5.0, 1000.0)
-    one = FinalOutcome("a", group, 4.0, costs, limits, False, False, False, excesses=(0.5, 0.0))
+    one = FinalOutcome("a", 4.0, costs, limits, False, False, False, excesses=(0.5, 0.0))
     both = replace(one, excesses=(0.25, 50.0))
     assert trial_note(one, (9.0, 9.0)).startswith("**infeasible, cost 0 by 0.50**: ")
     assert trial_note(both, (9.0, 9.0)).startswith("**infeasible, cost 0 by 0.25, cost 1 by 50.00**: ")
-    states = {group: [TrialStatus.COMPLETE, TrialStatus.COMPLETE, TrialStatus.FAILED]}
-    assert (
-        "| infeasible 2 of 3, cost 0 by up to 0.50, cost 1 by up to 50.00; failed 1 of 3 |"
-        in verdict_lines([one, both], states)[2]
-    )
 
 
 def test_outcomes_of_an_older_version_count_as_not_written(write: Callable[..., SweepStore]) -> None:
@@ -880,34 +880,6 @@ def test_outcomes_of_an_older_version_count_as_not_written(write: Callable[..., 
     path = store.figures_folder / "outcomes.csv"
     path.write_text(path.read_text().replace("excess_0", "worst_excess"))
     assert FinalOutcomes(store).lack_a_complete_trial()
-
-
-def test_failed_trials_are_in_the_table_of_verdicts() -> None:
-    group, other = ("map", "cpo", "none"), ("map", "cpo", "linear")
-    outcomes = [
-        FinalOutcome(str(seed), group, 4.0, (1.0,), (1.0,), is_feasible=True, is_solved=not seed, exact=True)
-        for seed in range(2)
-    ]
-    complete, failed, waiting = TrialStatus.COMPLETE, TrialStatus.FAILED, TrialStatus.WAITING
-    states = {group: [complete, failed, complete, failed, waiting], other: [failed, failed]}
-    assert verdict_lines(outcomes, states)[2:] == [
-        "| map | cpo | none | solved 1 of 5; feasible 1 of 5; failed 2 of 5; no result yet 1 of 5 "
-        "| 1.000 | 1.00 | 4.00 | 2 |",
-        "| map | cpo | linear | failed |  |  |  | 0 |",
-    ]
-    alone = verdict_lines(outcomes, {group: [complete, complete]})
-    assert alone[2].split(" | ")[3] == "solved 1 of 2; feasible 1 of 2"
-    assert verdict_lines([], states) == []
-    barred = ("map", "a|b", "none")
-    renamed = [replace(outcome, group=barred) for outcome in outcomes]
-    assert verdict_lines(renamed, {barred: [complete]})[2].startswith(r"| map | a\|b | none |")
-
-
-def test_a_long_table_of_verdicts_leaves_room_for_the_rest() -> None:
-    rows = [f"| task-{index} | cpo | none | solved | 5.00 | 5.00 | 9.50 | 1 |" for index in range(999)]
-    text = note("demo", {"complete": 999}, [], charts="#/charts", verdicts=rows, report="#/report")
-    assert len(text) < 8000
-    assert "More verdicts than fit here: see the report.\n\n[Report](#/report)\n\n**demo**: 999" in text
 
 
 def test_what_is_filmed_after_a_trials_end_reaches_its_run(write: Callable[..., SweepStore]) -> None:
