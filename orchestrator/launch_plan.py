@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 
+from recrl.orchestrator.counting import counted
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
@@ -135,6 +136,14 @@ class Plan:
         return code_warnings([(it.record.status, replace(it.code, versions=frozenset())) for it in kept])
 
     @property
+    def left_out_sentence(self) -> str:
+        """Sentence on the trials that the grid no longer has; empty for none."""
+        number = counted(len(self.orphans), "trial")
+        return (
+            f"no longer in the grid: {number}, kept on disk and left out of results" if self.orphans else ""
+        )
+
+    @property
     def counts(self) -> Mapping[PlannedAction, int]:
         """Number of trials by planned action."""
         found = Counter(trial.action for trial in self.trials)
@@ -186,10 +195,9 @@ def make_plan(specs: Sequence[TrialSpec], store: SweepStore, selection: TrialSel
     for spec in select(specs, selection.only):
         trial = store.trial(spec)
         record = trial.verified_record() if selection.rerun_damaged else trial.record()
-        action = _planned_action(record, selection)
         code = compare_files(trial, spec, installed)
-        if (code.differs and selection.rerun_changed) or trial.rerun_has_begun:
-            action = PlannedAction.RERUN
+        must_rerun = trial.rerun_has_begun or (selection.rerun_changed and code.differs)
+        action = PlannedAction.RERUN if must_rerun else _planned_action(record, selection)
         trials.append(PlannedTrial(spec, action, record, code))
     orphans = tuple(trial for trial in store.trials() if trial.folder.name not in wanted)
     return Plan(tuple(trials), orphans)
@@ -272,6 +280,12 @@ def usable_cores(quota_file: Path = Path("/sys/fs/cgroup/cpu.max")) -> int:
 
 
 def _planned_action(record: TrialRecord, selection: TrialSelection) -> PlannedAction:
+    """Return the action for a trial that need not run again from its beginning.
+
+    A complete trial is left alone, a failed one unless ``retry_failed`` is set. A damaged trial that had not
+    ended is repaired. One that had ended, or whose format is another version's, is left alone; with
+    ``rerun_damaged`` it is repaired, except while its files cannot be read. Others begin or continue.
+    """
     match record.status:
         case TrialStatus.COMPLETE:
             return PlannedAction.COMPLETE

@@ -227,7 +227,7 @@ def load(store: SweepStore) -> Sweep:
     sweep = assemble(
         store.name,
         [facts for facts, _ in read],
-        {name: joined([rows[name] for _, rows in read]) for name in ROWS},
+        {name: concatenated([rows[name] for _, rows in read]) for name in ROWS},
         grid=grid,
         notes=[problem] if problem else [],
     )
@@ -267,7 +267,7 @@ def load_episodes(
         return episodes if columns is None else episodes.reindex(columns=list(columns))
 
     keys, _ = keys_of(specs)
-    return keys.put_before(joined([rows(trial) for trial in trials]), columns or EPISODE_COLUMNS)
+    return keys.put_before(concatenated([rows(trial) for trial in trials]), columns or EPISODE_COLUMNS)
 
 
 def assemble(
@@ -323,7 +323,7 @@ def is_made_again(note: str) -> bool:
     return any(text in note for text in (DOUBLES, UNKNOWN_OPTIMUM, NO_OPTIMUM, MISFIT))
 
 
-def joined(frames: Sequence[pd.DataFrame]) -> pd.DataFrame:
+def concatenated(frames: Sequence[pd.DataFrame]) -> pd.DataFrame:
     """Concatenate the trials' data frames, with the column TRIAL: their position in ``frames``."""
     filled = [frame for frame in frames if len(frame)]
     rows = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()

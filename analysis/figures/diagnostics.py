@@ -23,7 +23,7 @@ from recrl.analysis.data.cost_names import cost_suffix
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import IN_FORCE_COLOUR, LIMIT_COLOUR, TEXT_WIDTH, MethodStyle
-from recrl.analysis.statistics.curves import Extent, mean_curve
+from recrl.analysis.statistics.curves import ShownSteps, mean_curve
 from recrl.environments.cmdp import Floats
 from recrl.orchestrator.files.trial_files import POLICY_NOISE
 
@@ -57,8 +57,8 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
     trials, updates, events = (
         panels.rows_of(frame, task, agent) for frame in (sweep.trials, sweep.updates, sweep.events)
     )
-    extent = Extent.of(trials)
-    edges = extent.grid(BINS)
+    shown_steps = ShownSteps.of(trials)
+    edges = shown_steps.grid(BINS)
     look = styles.method_styles(list(sweep.trials["method"].cat.categories))
     methods = [method for method in look if (updates["method"] == method).any()]
     quantities = (
@@ -79,7 +79,7 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
             by_quantity = dict(zip(rows, column, strict=True))
             for quantity, axes in by_quantity.items():
                 _panel(axes, chosen, quantity, edges, look[method])
-                panels.phase_boundary(axes, extent.boundary, extent.total)
+                panels.phase_boundary(axes, shown_steps.boundary, shown_steps.total)
             _limits(column[0], chosen, f"limit_{cost}")
             noise = events.loc[_is_noise(events, method), "end_step"]
             _event_marks(column[0], noise, look[method], NOISE_MARK)
@@ -87,7 +87,7 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
             if "kl" in by_quantity:
                 _divergence_marks(by_quantity["kl"], chosen, look[method], target)
             column[0].set_title(method)
-            panels.step_axis(column[-1], 0.0, extent.total)
+            panels.step_axis(column[-1], 0.0, shown_steps.total)
             column[-1].set_xlabel("environment steps")
         largest = updates[f"cost_{cost}"].fillna(0.0).max()  # 0 before the first episode has finished
         scale = _scale_costs(grid[0], limit, float(largest))

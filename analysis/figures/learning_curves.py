@@ -24,7 +24,7 @@ from recrl.analysis.data.labels import occurring
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import panels, styles
 from recrl.analysis.figures.styles import TEXT_WIDTH, MethodStyle
-from recrl.analysis.statistics.curves import MEAN, CurveAverage, Extent, mean_curve
+from recrl.analysis.statistics.curves import MEAN, CurveAverage, ShownSteps, mean_curve
 from recrl.analysis.statistics.verdicts import SOLVED_GAP
 from recrl.environments.cmdp import Floats
 
@@ -167,13 +167,13 @@ def _pair(
     averaging: CurveAverage,
 ) -> None:
     """Draw one quantity over all of training, and magnified in the deployment phase."""
-    extent = Extent.of(trials)
-    boundary, total = extent.boundary, extent.total
-    deployment_updates = max(2, round(extent.updates * (total - boundary) / total))
+    shown_steps = ShownSteps.of(trials)
+    boundary, total = shown_steps.boundary, shown_steps.total
+    deployment_updates = max(2, round(shown_steps.updates * (total - boundary) / total))
     deployment_edges = np.linspace(boundary, total, min(DEPLOYMENT_BINS, deployment_updates) + 1)
     deployed = updates[updates["end_step"] > boundary]
     for axes, edges, rows in (
-        (whole, extent.grid(BINS), updates),
+        (whole, shown_steps.grid(BINS), updates),
         (magnified, deployment_edges, deployed),
     ):
         _curves(axes, rows, quantity, edges, look, averaging=averaging)
@@ -215,8 +215,8 @@ def _curves(
 def _curriculum_panel(
     axes: Axes, trials: pd.DataFrame, updates: pd.DataFrame, look: dict[str, MethodStyle], i: int
 ) -> None:
-    extent = Extent.of(trials)
-    edges = extent.grid(BINS)
+    shown_steps = ShownSteps.of(trials)
+    edges = shown_steps.grid(BINS)
     infinite = 0
     for position, (method, style) in enumerate(look.items()):
         chosen = updates[updates["method"] == method]
@@ -241,9 +241,9 @@ def _curriculum_panel(
         if np.isfinite(last):
             _mark_infinite_limits(axes, last, style, number=infinite)
             infinite += 1
-    panels.step_axis(axes, 0.0, extent.total)
+    panels.step_axis(axes, 0.0, shown_steps.total)
     panels.reference_lines(axes, trials, f"cost_{i}")
-    panels.phase_boundary(axes, extent.boundary, extent.total)
+    panels.phase_boundary(axes, shown_steps.boundary, shown_steps.total)
 
 
 def _end_of_infinite_limits(updates: pd.DataFrame, trials: pd.DataFrame, i: int) -> float:

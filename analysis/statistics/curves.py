@@ -86,7 +86,7 @@ def step_grid(boundary_step: int, total_steps: int, *, updates: int, bins: int) 
 
 
 @dataclass(frozen=True)
-class Extent:
+class ShownSteps:
     """The environment steps that a figure of several trials shows, and the policy updates in them.
 
     Attributes:
@@ -101,7 +101,7 @@ class Extent:
 
     @classmethod
     def of(cls, trials: pd.DataFrame) -> Self:
-        """Return the extent of trials of one task and agent; rows of ``Sweep.trials``."""
+        """Return the steps of trials of one task and agent; rows of ``Sweep.trials``."""
         total = int(trials["total_steps"].max())
         return cls(int(trials["boundary_step"].min()), total, int(total // trials["steps_per_update"].min()))
 

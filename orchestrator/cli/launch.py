@@ -25,7 +25,6 @@ from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.launch_grid import LaunchListener, LaunchOptions, LaunchOutcome, launch_grid
 from recrl.orchestrator.launch_plan import Plan
-from recrl.orchestrator.launch_warnings import left_out_sentence
 from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.run_sweep import SweepResult
 from recrl.orchestrator.sweep_place import SweepPlace
@@ -94,8 +93,8 @@ class _Printer(LaunchListener):
         """Print the plan; show the progress while trials run."""
         say_plan(plan, self._grid, self._console, at_once=at_once, where=where)
         say_other_code(plan, self._console)
-        if sentence := left_out_sentence(plan):
-            say(self._console, sentence)
+        if plan.left_out_sentence:
+            say(self._console, plan.left_out_sentence)
         if not plan.to_do:
             self._has_run = True
             yield

@@ -19,7 +19,6 @@ from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.grid.only_selection import parse_only
 from recrl.orchestrator.launch_grid import room
 from recrl.orchestrator.launch_plan import Plan, TrialSelection, estimate, kind_of, make_plan, unmeasured
-from recrl.orchestrator.launch_warnings import grid_warnings
 from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.spec import TrialSpec
 
@@ -109,7 +108,7 @@ def say_plan(
 
 def _warn_of_steps(grid: GridSpec, specs: Sequence[TrialSpec], console: Console) -> None:
     """Print the warnings about tasks of unknown horizon and about trials without a deployment phase."""
-    for sentence in grid_warnings(grid, specs):
+    for sentence in grid.warnings(specs):
         say(console, f"warning: {sentence}")
 
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
 from recrl.environments.cmdp import CostLimits
-from recrl.orchestrator.grid.file_models import (
-    Exclusion,
-    Resources,
-    Run,
-)
+from recrl.orchestrator.grid.file_models import Exclusion, Resources, Run
 from recrl.orchestrator.spec import Choice, TrialSpec
+from recrl.orchestrator.trial_warnings import no_deployment_sentence, unknown_horizon_sentence
 
 
 @dataclass(frozen=True)
@@ -64,6 +62,15 @@ class GridSpec:
         cells = product(self.seeds, self.tasks, self.agents, self.methods)
         specs = (self._trial(*cell) for cell in cells)
         return tuple(spec for spec in specs if not any(rule.matches(spec) for rule in self.exclude))
+
+    def warnings(self, specs: Sequence[TrialSpec]) -> list[str]:
+        """Return sentences on tasks of unknown horizon and on trials without an update in deployment.
+
+        Args:
+            specs: the trials that are to run.
+        """
+        endless = [cell.task.label for cell in self.tasks if cell.horizon is None]
+        return [*filter(None, (unknown_horizon_sentence(endless), no_deployment_sentence(specs)))]
 
     def _trial(self, seed: int, cell: TaskCell, agent: Choice, method: Choice) -> TrialSpec:
         deploy_steps = round(self.run.total_steps * self.run.deploy_fraction)

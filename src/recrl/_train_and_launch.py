@@ -28,7 +28,6 @@ from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid, read_grid
 from recrl.orchestrator.launch_grid import LaunchListener, LaunchOptions, launch_grid
 from recrl.orchestrator.launch_plan import Plan
-from recrl.orchestrator.launch_warnings import grid_warnings, left_out_sentence
 from recrl.orchestrator.spec import TrialStatus
 
 if TYPE_CHECKING:
@@ -72,7 +71,7 @@ def validate(grid: Grid, *, trust: bool = False) -> GridSpec:
     """
     with following(trust):
         checked = _checked(grid, build=True)
-    _warn(grid_warnings(checked, checked.trials()))
+    _warn(checked.warnings(checked.trials()))
     return checked
 
 
@@ -158,7 +157,7 @@ class _PlanWarnings(LaunchListener):
 
     def planned(self, plan: Plan, *, at_once: int, where: str) -> AbstractContextManager[None]:
         """Warn before the first trial."""
-        sentences = (*grid_warnings(self._grid, plan.to_do), *plan.code_warnings, left_out_sentence(plan))
+        sentences = (*self._grid.warnings(plan.to_do), *plan.code_warnings, plan.left_out_sentence)
         _warn(filter(None, sentences))
         return nullcontext()
 

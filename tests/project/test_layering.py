@@ -81,7 +81,7 @@ LAYERS = (
     ("executors", "sweep_place", "sweep_progress", "trial", "trial_warnings"),
     ("grid", "remote"),
     ("find_sweep", "launch_plan", "tracking"),
-    ("launch_warnings", "ray", "report_refresh", "run_sweep"),
+    ("ray", "report_refresh", "run_sweep"),
     ("launch_grid",),
     ("cli",),
 )
