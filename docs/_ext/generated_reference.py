@@ -132,8 +132,8 @@ def grid_file() -> str:
         "A grid is a product: every task x agent x method x seed, less what `exclude` names.",
         "All mistakes are reported at once, each with its line. No trial starts before the file "
         "is correct.\n",
-        "`recrl-sweep schema > recrl.schema.json` writes the JSON schema. Editors with the YAML language server "
-        "complete keys with it, if the grid begins with the line "
+        "`recrl-sweep schema > recrl.schema.json` writes the JSON schema. With it editors that have the YAML "
+        "language server complete keys, if the grid begins with the line "
         "`# yaml-language-server: $schema=recrl.schema.json`.\n",
         "## Top level\n",
         *option_table(GridFile),
