@@ -1,38 +1,29 @@
-"""Options of the dynamic curriculum, with the paper's values."""
+"""Options of the dynamic curriculum and of Algorithm 2, which is its preset ``paper``."""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
 from recrl.environments.options import Options
 from recrl.teachers.start_limits import START_FRACTION
-from recrl.teachers.windows import WindowUnit
 
-# The literal pseudocode. The paper does not give W and eps_pi: W is five updates of 16 episodes.
-PAPER = {
-    "start_fraction": 0.0,
-    "window": 80,
-    "window_unit": "episodes",
-    "window_grows": False,
-    "return_floor": 0.0,
-    "cost_floor": 0.0,
-    "adherence_tolerance": "none",
-    "windows_after_noise": 1,
-    "remaining": "episodes",
-    "clock_reset": "convergence",
-    "dimensions": "joint",
-    "overlapping_episodes": "count",
-}
+# Algorithm 2. The paper gives neither W nor eps_pi: W is five updates of 16 episodes. It has no floors.
+PAPER = {"start_fraction": 0.0, "window": 80, "return_floor": 0.0, "cost_floor": 0.0}
 
 
 class DynamicConfig(Options):
-    """The settings of the dynamic curriculum."""
+    """The settings of the dynamic curriculum.
+
+    The preset ``paper`` selects Algorithm 2 (``recrl.teachers.algorithm_2``), with the values of ``PAPER``
+    for options that are not given.
+    """
 
     preset: Literal["recommended", "paper"] = Field(
         default="recommended",
-        description="Source of unset options: recommended (ours), or paper (Algorithm 2 literally).",
+        description="recommended: our curriculum; paper: Algorithm 2 literally, with start_fraction 0, "
+        "window 80 and no floors.",
     )
     start_fraction: float = Field(
         default=START_FRACTION,
@@ -42,76 +33,34 @@ class DynamicConfig(Options):
         "train_limits is infinite; 0 starts at infinity, as Algorithm 2 does.",
     )
     window: int = Field(
-        default=5, ge=1, description="W of Algorithm 2, in window_unit; the paper does not give it."
-    )
-    window_unit: WindowUnit = Field(
-        default="updates",
-        description="Unit of W: policy updates, or finished episodes (rounded up to whole updates).",
-    )
-    window_grows: bool = Field(
-        default=True,
-        description="Whether a window includes more updates until the standard errors of its "
-        "means are within the tolerances, and it has at least 10 episodes (ours). The "
-        "tolerances are then relative to the mean or to the episodes' standard deviation, "
-        "whichever is larger.",
+        default=5,
+        ge=1,
+        description="W of Algorithm 2, which the paper does not give. It counts policy updates, and a window "
+        "includes more until its means are precise. With preset: paper it counts finished episodes.",
     )
     return_tolerance: float = Field(
         default=0.1,
         gt=0.0,
-        description="eps_r: largest relative change of a converged mean return (paper: 0.1). With "
-        "window_grows a window needs up to 1 / eps_r^2 episodes.",
+        description="eps_r: largest relative change of a converged mean return (paper: 0.1). A window needs "
+        "up to 1 / eps_r^2 episodes, except with preset: paper.",
     )
     cost_tolerance: float = Field(
         default=0.1,
         gt=0.0,
-        description="eps_c: largest relative change of a converged mean cost (paper: 0.1). With "
-        "window_grows a window needs up to 1 / eps_c^2 episodes.",
+        description="eps_c: largest relative change of a converged mean cost (paper: 0.1). A window needs "
+        "up to 1 / eps_c^2 episodes, except with preset: paper.",
     )
     return_floor: float = Field(
         default=1.0,
         ge=0.0,
         description="Least absolute mean return in the convergence test, in units of the return; "
-        "smaller ones count as this.",
+        "smaller ones count as this. Not with preset: paper.",
     )
     cost_floor: float = Field(
         default=1.0,
         ge=0.0,
-        description="Least mean cost in the convergence test, and least limit in adherence_tolerance, in "
-        "units of the episode cost; smaller ones count as this.",
-    )
-    adherence_tolerance: Literal["relative", "standard_error", "none"] = Field(
-        default="relative",
-        description="Tolerance by which a mean cost may exceed its limit. relative: one standard "
-        "error or cost_tolerance x the limit, whichever is larger. standard_error: "
-        "one standard error. none: nothing (Algorithm 2, line 6).",
-    )
-    windows_after_noise: int = Field(
-        default=2,
-        ge=1,
-        le=2,
-        description="Number of windows that must lie after the last noise: two, or one, the newer (literal).",
-    )
-    remaining: Literal["windows", "episodes"] = Field(
-        default="windows",
-        description="Divisor of the step of line 7. windows: remaining windows but two, which "
-        "can reach deploy_limits before B. episodes: remaining episodes after the next "
-        "one, B - b (literal), which does not.",
-    )
-    clock_reset: Literal["change", "convergence"] = Field(
-        default="change",
-        description="When last_change is reset: when limits or policy have changed, or whenever "
-        "the agent has converged, even if nothing changes then (line 11, literal).",
-        exclude_if=lambda value: value == "change",  # trials from before this option keep their identity
-    )
-    dimensions: Literal["separate", "joint"] = Field(
-        default="separate",
-        description="Whether each limit falls separately, or all together once all costs have "
-        "converged and are kept (literal).",
-    )
-    overlapping_episodes: Literal["count", "ignore"] = Field(
-        default="ignore",
-        description="Whether episodes count that may have begun before the last change of limits or policy. "
-        "If they are ignored (ours), windows begin later by the longest episode, and line 7 has fewer steps.",
+        description="Least mean cost in the convergence test, and least limit in the tolerance above a "
+        "limit, in units of the episode cost; smaller ones count as this. Not with preset: paper.",
     )
     policy_noise: float = Field(
         default=0.3,
@@ -125,3 +74,10 @@ class DynamicConfig(Options):
     def _fill_in_preset(cls, options: Any) -> Any:
         is_paper = isinstance(options, dict) and options.get("preset") == "paper"
         return {**PAPER, **options} if is_paper else options
+
+    @model_validator(mode="after")
+    def _algorithm_2_has_no_floors(self) -> Self:
+        for name in ("return_floor", "cost_floor") if self.preset == "paper" else ():
+            if (value := getattr(self, name)) != 0.0:
+                raise ValueError(f"{name} has no effect with preset: paper: leave it out, got {value}")
+        return self

@@ -1,22 +1,20 @@
 """The decisions of the dynamic curriculum: lines 5 to 10 of Algorithm 2, as functions of windows.
 
-``recrl.teachers.dynamic`` has the curriculum, and what these functions do where Algorithm 2 has gaps.
+``recrl.teachers.dynamic`` has the curriculum, and says how and why these functions differ from Algorithm 2.
+``recrl.teachers.algorithm_2`` uses ``has_converged``, ``keeps_limit`` and ``next_limit``, too.
 
-Notation: d limits in force, d_d deployment limits, B the training budget in environment steps, b an episode;
-C-bar and r-bar the mean episode cost and return of a window; k the number of costs, eps_r, eps_c the paper's
-settings.
+Notation: d limits in force, d_d deployment limits, B the training budget in environment steps; C-bar and
+r-bar the mean episode cost and return of a window; eps_r, eps_c, eps_pi the paper's settings.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Literal
 
-from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.teachers.dynamic_options import DynamicConfig
 from recrl.teachers.windows import WindowStatistics
 
-LEAST_EPISODES = 10  # of a window that grows; a standard error from fewer episodes is itself uncertain
+LEAST_EPISODES = 10  # of a window; a standard error from fewer episodes is itself uncertain
 
 
 def has_converged(new: float, old: float, *, tolerance: float, floor: float) -> bool:
@@ -71,128 +69,80 @@ def decide(
     old: WindowStatistics,
     new: WindowStatistics,
     *,
-    limits: CostLimits,
-    deploy_limits: CostLimits,
+    limit: float,
+    deploy_limit: float,
     remaining: int,
     config: DynamicConfig,
-) -> CurriculumStep:
-    """Return the next step, by lines 5 to 10 of Algorithm 2.
+) -> tuple[float, float]:
+    """Return the next limit of one cost, and policy noise, by lines 5 to 10 of Algorithm 2.
 
     Args:
-        old: the window before the last.
-        new: the last window, entirely after the last change.
-        limits: d in force, [k].
-        deploy_limits: d_d, [k].
+        old: the window before the last, with this cost only and at least one episode.
+        new: the last window, likewise, entirely after the last change.
+        limit: d in force.
+        deploy_limit: d_d.
         remaining: n of ``next_limit``.
         config: the settings.
+
+    Returns:
+        The limit and the noise: eps_pi for an agent that is stuck, else 0.
     """
-    if old.episodes == 0 or new.episodes == 0:
-        return CurriculumStep(limits)
-    settled = which_converged(old, new, config)
-    kept = _kept(new, limits, config)
-    if config.dimensions == "joint":
-        kept = [all(kept)] * len(limits)
-    is_stuck = any(is_settled and not keeps for is_settled, keeps in zip(settled, kept, strict=True))
-    lowered = tuple(
-        next_limit(limit, cost, deploy, remaining=remaining) if is_settled and keeps else limit
-        for limit, cost, deploy, is_settled, keeps in zip(
-            limits, new.mean_costs, deploy_limits, settled, kept, strict=True
-        )
-    )
-    return CurriculumStep(CostLimits(lowered), config.policy_noise if is_stuck else 0.0)
+    if not _have_converged(old, new, config):
+        return limit, 0.0
+    (cost,), (error,) = new.mean_costs, new.standard_errors
+    tolerance = max(error, config.cost_tolerance * max(limit, config.cost_floor))
+    if not keeps_limit(cost, limit, tolerance=tolerance):
+        return limit, config.policy_noise
+    return next_limit(limit, cost, deploy_limit, remaining=remaining), 0.0
 
 
-def which_converged(old: WindowStatistics, new: WindowStatistics, config: DynamicConfig) -> list[bool]:
-    """Whether the return and the cost of each dimension have converged (line 5), [k].
-
-    It is false if a window has no episode. With joint limits, it is the same for all costs.
-    """
-    if old.episodes == 0 or new.episodes == 0:
-        return [False] * len(new.mean_costs)
-    return_floor, cost_floors = _floors(old, config)
-    return_converged = has_converged(
+def _have_converged(old: WindowStatistics, new: WindowStatistics, config: DynamicConfig) -> bool:
+    """Whether the return and the cost have converged (line 5)."""
+    return_floor, cost_floor = _floors(old, config)
+    (cost,), (before,) = new.mean_costs, old.mean_costs
+    return has_converged(
         new.mean_return, old.mean_return, tolerance=config.return_tolerance, floor=return_floor
-    )
-    converged = [
-        return_converged and has_converged(cost, before, tolerance=config.cost_tolerance, floor=floor)
-        for cost, before, floor in zip(new.mean_costs, old.mean_costs, cost_floors, strict=True)
-    ]
-    return [all(converged)] * len(converged) if config.dimensions == "joint" else converged
-
-
-def _floors(window: WindowStatistics, config: DynamicConfig) -> tuple[float, tuple[float, ...]]:
-    """Return the scales for comparing the mean return and the mean costs: the floor, or the spread."""
-    if not config.window_grows:
-        return config.return_floor, (config.cost_floor,) * len(window.mean_costs)
-    cost_floors = tuple(max(spread, config.cost_floor) for spread in window.cost_spreads)
-    return max(window.return_spread, config.return_floor), cost_floors
+    ) and has_converged(cost, before, tolerance=config.cost_tolerance, floor=cost_floor)
 
 
 def is_precise(window: WindowStatistics, config: DynamicConfig) -> bool:
-    """Whether the standard errors of a window's means are within the tolerances.
+    """Whether the standard errors of a window's means are within the tolerances; the window has one cost.
 
-    s <= eps max(|mean|, floor, standard deviation), s the standard error of the return and of each cost. With
+    s <= eps max(|mean|, floor, standard deviation), s the standard error of the return and of the cost. With
     eps = 0.1 a hundred episodes are always enough. Fewer than ``LEAST_EPISODES`` never are.
     """
     if window.episodes < LEAST_EPISODES:
         return False
-    return_floor, cost_floors = _floors(window, config)
-    root = math.sqrt(window.episodes)
-    return_scale = max(abs(window.mean_return), return_floor)
-    return window.return_spread <= config.return_tolerance * return_scale * root and all(
-        spread <= config.cost_tolerance * max(cost, floor) * root
-        for spread, cost, floor in zip(window.cost_spreads, window.mean_costs, cost_floors, strict=True)
+    return_floor, cost_floor = _floors(window, config)
+    (cost,), (cost_spread,), root = window.mean_costs, window.cost_spreads, math.sqrt(window.episodes)
+    return_scale, cost_scale = max(abs(window.mean_return), return_floor), max(cost, cost_floor)
+    return (
+        window.return_spread <= config.return_tolerance * return_scale * root
+        and cost_spread <= config.cost_tolerance * cost_scale * root
     )
 
 
-def _kept(new: WindowStatistics, limits: CostLimits, config: DynamicConfig) -> list[bool]:
-    """Whether each limit is kept, [k]."""
-    return [
-        keeps_limit(cost, limit, tolerance=_tolerance(limit, error, config))
-        for cost, limit, error in zip(new.mean_costs, limits, new.standard_errors, strict=True)
-    ]
+def _floors(window: WindowStatistics, config: DynamicConfig) -> tuple[float, float]:
+    """Return the least scales for comparing the mean return and the mean cost: the floor, or the spread."""
+    (cost_spread,) = window.cost_spreads
+    return max(window.return_spread, config.return_floor), max(cost_spread, config.cost_floor)
 
 
-def _tolerance(limit: float, standard_error: float, config: DynamicConfig) -> float:
-    """Return the tolerance by which a mean cost may exceed its limit."""
-    match config.adherence_tolerance:
-        case "none":
-            return 0.0
-        case "standard_error":
-            return standard_error
-        case "relative":
-            return max(standard_error, config.cost_tolerance * max(limit, config.cost_floor))
-
-
-def steps_left(
-    last: WindowStatistics,
-    *,
-    env_steps: int,
-    train_steps: int,
-    unit: Literal["windows", "episodes"],
-    duration: int = 0,
-) -> int:
+def steps_left(last: WindowStatistics, *, env_steps: int, train_steps: int, duration: int) -> int:
     """Return the number of steps of ``next_limit`` in the remaining budget, at the last window's pace.
 
-    B is in environment steps, and its number of episodes is not known in advance. At the steps and episodes
-    of the last window, (B - env steps) / steps windows remain, with that multiple of its episodes. Both are
-    rounded down. The last two windows are not counted, nor is the next episode: Algorithm 2 decides before it
-    runs episode b, when B - b + 1 episodes remain.
+    These are the remaining windows but two, rounded down.
 
     Args:
         last: the last window.
         env_steps: taken so far.
         train_steps: B.
-        unit: of the result.
-        duration: of the longest episode, in environment steps over all environments, if windows begin that
-            much after a change; else 0.
+        duration: of the longest episode, in environment steps over all environments. Windows begin that much
+            after a change.
 
     >>> last = WindowStatistics(1000, episodes=8, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,))
-    >>> [steps_left(last, env_steps=5500, train_steps=10000, unit=unit) for unit in ("windows", "episodes")]
-    [2, 35]
+    >>> [steps_left(last, env_steps=0, train_steps=20_000, duration=duration) for duration in (0, 1000)]
+    [18, 8]
     """
-    steps = train_steps - env_steps
-    if unit == "episodes":
-        return steps * last.episodes // max(1, last.env_steps) - 1
     reserve = 2 * last.env_steps + duration
-    return (steps - reserve) // max(1, last.env_steps + duration)
+    return (train_steps - env_steps - reserve) // max(1, last.env_steps + duration)

@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from recrl.environments.plugins import resolve
+from recrl.teachers.algorithm_2 import Algorithm2Teacher
 from recrl.teachers.cooling import CoolingConfig, CoolingTeacher
 from recrl.teachers.dynamic import DynamicTeacher
 from recrl.teachers.dynamic_options import DynamicConfig
@@ -60,6 +61,12 @@ def _decay(summary: str, decay: Decay) -> TeacherKind:
     return TeacherKind(summary, DecayConfig, partial(decay_teacher, decay=decay), measures_start=True)
 
 
+def _dynamic_teacher(spec: TeacherSpec) -> Teacher:
+    """Make our dynamic curriculum, or with ``preset: paper`` Algorithm 2."""
+    is_paper = DynamicConfig.model_validate(dict(spec.options)).preset == "paper"
+    return Algorithm2Teacher(spec) if is_paper else DynamicTeacher(spec)
+
+
 TEACHERS: dict[str, TeacherKind] = {
     "none": TeacherKind("No curriculum: d_d from the start.", NoConfig, none_teacher),
     "step": TeacherKind(
@@ -80,7 +87,7 @@ TEACHERS: dict[str, TeacherKind] = {
     "dynamic": TeacherKind(
         "CLiC_D: lower limits for an agent that keeps them, noise for an agent that is stuck.",
         DynamicConfig,
-        DynamicTeacher,
+        _dynamic_teacher,
         measures_start=True,
         compares_costs=True,
     ),

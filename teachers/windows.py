@@ -1,9 +1,9 @@
-"""Statistics of consecutive policy updates, and the two windows that the dynamic curriculum compares.
+"""Statistics of consecutive policy updates, and the two windows that Algorithm 2 compares.
 
 A policy is constant between two updates, so a window consists of whole updates. Its episodes are summed up
 once, when they are reported, and a state keeps one short record for each update of the last two windows.
 
-Notation: k the number of costs, W a window's size.
+Notation: k the number of costs.
 """
 
 from __future__ import annotations
@@ -11,11 +11,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 from recrl.environments.cmdp import EpisodeStats
-
-WindowUnit = Literal["updates", "episodes"]
 
 
 @dataclass(frozen=True)
@@ -126,37 +124,25 @@ class WindowStatistics:
         return cls(env_steps, episodes, mean_return, tuple(mean_costs), tuple(cost_scatter), return_scatter)
 
 
-def extend(
-    history: Sequence[WindowStatistics], latest: WindowStatistics, *, unit: WindowUnit
-) -> tuple[WindowStatistics, ...]:
-    """Return the history with one more update.
-
-    If windows are counted in episodes, the steps of an update without any are added to the next one with
-    some. So a history is never longer than its number of episodes.
-    """
-    if unit == "episodes" and history and history[-1].episodes == 0:
-        return (*history[:-1], WindowStatistics.pooled([history[-1], latest]))
-    return (*history, latest)
-
-
 def latest_window(
     history: Sequence[WindowStatistics],
     size: int,
     *,
-    unit: WindowUnit,
     is_enough: Callable[[WindowStatistics], bool] | None = None,
 ) -> int | None:
-    """Return how many of the last updates make a window of W; None if there are too few.
+    """Return how many of the last updates make a window; None if there are too few.
 
-    ``updates``: the last W updates. ``episodes``: the fewest last updates with at least W finished episodes;
-    with one episode per update, as in Algorithm 2, these are the last W episodes. With ``is_enough`` a window
-    includes more updates until it is true.
+    These are the last ``size`` updates. With ``is_enough`` a window includes more updates until it is true.
+
+    Args:
+        history: statistics of each update, in order.
+        size: least number of updates, at least 1.
+        is_enough: of the pooled statistics of a window.
     """
-    count = _latest_of_size(history, size, unit=unit)
-    if count is None or is_enough is None:
-        return count
-    window = WindowStatistics.pooled(history[len(history) - count :])
-    while not is_enough(window):
+    if len(history) < size:
+        return None
+    count, window = size, WindowStatistics.pooled(history[len(history) - size :])
+    while is_enough is not None and not is_enough(window):
         count += 1
         if count > len(history):
             return None
@@ -164,30 +150,18 @@ def latest_window(
     return count
 
 
-def _latest_of_size(history: Sequence[WindowStatistics], size: int, *, unit: WindowUnit) -> int | None:
-    if unit == "updates":
-        return size if len(history) >= size else None
-    episodes = 0
-    for count, statistics in enumerate(reversed(history), start=1):
-        episodes += statistics.episodes
-        if episodes >= size:
-            return count
-    return None
-
-
 def last_two_windows(
     history: Sequence[WindowStatistics],
     size: int,
     *,
-    unit: WindowUnit,
     is_enough: Callable[[WindowStatistics], bool] | None = None,
 ) -> tuple[tuple[WindowStatistics, ...], tuple[WindowStatistics, ...]] | None:
     """Return the updates of the last two windows, the older one first; None if there are too few."""
-    new = latest_window(history, size, unit=unit, is_enough=is_enough)
+    new = latest_window(history, size, is_enough=is_enough)
     if new is None:
         return None
     split = len(history) - new
-    old = latest_window(history[:split], size, unit=unit, is_enough=is_enough)
+    old = latest_window(history[:split], size, is_enough=is_enough)
     if old is None:
         return None
     return tuple(history[split - old : split]), tuple(history[split:])
