@@ -52,3 +52,21 @@ def play(
 def obedient(step: CurriculumStep, update: int) -> tuple[float, tuple[float, ...]]:
     """An ideal agent: its costs are at the limits at once."""
     return 9.5, step.limits.values
+
+
+def recovering() -> Agent:
+    """An agent that costs 5.9 at first, and 9, 8, 7, 6, 5, 5, 5 ... after each noise."""
+    last_noise: list[int] = []
+
+    def settles(step: CurriculumStep, update: int) -> tuple[float, tuple[float, ...]]:
+        if step.policy_noise > 0.0 and update not in last_noise:
+            last_noise.append(update)
+        return 9.5, (max(5.0, 9.0 - (update - last_noise[-1])) if last_noise else 5.9,)
+
+    return settles
+
+
+def noises(agent: Agent, *, updates: int, **options: Any) -> list[int]:
+    """After which updates an agent gets noise, under a limit of 5, with two episodes per update."""
+    run = play(agent, train=(5.0,), deploy=(5.0,), updates=updates, episodes=lambda step: 2, **options)
+    return [update for update, noise in enumerate(run.noise, start=1) if noise > 0.0]

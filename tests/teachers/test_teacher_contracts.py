@@ -28,7 +28,7 @@ VARIANTS: list[tuple[str, dict[str, Any]]] = [
     *((name, {}) for name in TEACHERS),
     ("linear", {"start_fraction": 0.1}),
     ("dynamic", {"window": 1, "return_tolerance": 1.0, "cost_tolerance": 1.0}),
-    ("dynamic", {"window": 2, "window_unit": "episodes", "start_fraction": 0.0}),
+    ("dynamic", {"window": 2, "start_fraction": 0.0}),
     ("dynamic", {"preset": "paper", "window": 2, "return_tolerance": 0.5}),
 ]
 CONTRACT = settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow])

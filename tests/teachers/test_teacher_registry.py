@@ -71,9 +71,11 @@ def test_the_entry_says_what_a_teacher_does(name: str) -> None:
     assert kind.rewards_entropy == (late_step(name, 1.0).entropy_coefficient is not None)
 
 
-@pytest.mark.parametrize("name", TEACHERS)
-def test_resolved_settings_validate_to_themselves(name: str) -> None:
-    resolved = teacher_config(name, {})
+@pytest.mark.parametrize(
+    ("name", "options"), [*((name, {}) for name in TEACHERS), ("dynamic", {"preset": "paper"})]
+)
+def test_resolved_settings_validate_to_themselves(name: str, options: dict[str, Any]) -> None:
+    resolved = teacher_config(name, options)
     assert teacher_config(name, resolved.model_dump()) == resolved
 
 
@@ -107,7 +109,6 @@ def test_an_unknown_option_is_refused(name: str) -> None:
         ("linear", {"start_fraction": 0.0}),
         ("dynamic", {"start_fraction": -0.1}),
         ("dynamic", {"window": 0}),
-        ("dynamic", {"window_unit": "steps"}),
         ("dynamic", {"return_tolerance": -0.1}),
         ("dynamic", {"cost_floor": -1.0}),
         ("dynamic", {"policy_noise": 1.5}),
@@ -117,6 +118,25 @@ def test_an_unknown_option_is_refused(name: str) -> None:
 def test_an_option_out_of_its_range_is_refused(name: str, options: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match=next(iter(options))):
         make_teacher(spec(name, **options))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("window_unit", "updates"),
+        ("window_grows", True),
+        ("adherence_tolerance", "relative"),
+        ("windows_after_noise", 2),
+        ("remaining", "windows"),
+        ("clock_reset", "change"),
+        ("dimensions", "separate"),
+        ("overlapping_episodes", "ignore"),
+    ],
+)
+@pytest.mark.parametrize("preset", ["recommended", "paper"])
+def test_a_switch_of_earlier_versions_is_an_unknown_option(name: str, value: Any, preset: str) -> None:
+    with pytest.raises(ValidationError, match=f"{name}\n  Extra inputs are not permitted"):
+        make_teacher(spec("dynamic", preset=preset, **{name: value}))
 
 
 def test_the_paper_preset_fills_in_what_is_not_given() -> None:

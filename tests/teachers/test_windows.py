@@ -5,7 +5,7 @@ import math
 import pytest
 
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
-from recrl.teachers.windows import WindowStatistics, extend, last_two_windows
+from recrl.teachers.windows import WindowStatistics, last_two_windows
 
 
 def of_costs(*costs: float, env_steps: int = 100) -> WindowStatistics:
@@ -43,35 +43,25 @@ def test_pooled_updates_are_one_update() -> None:
 
 def test_windows_of_updates_count_updates() -> None:
     history = [of_costs(c) for c in (1.0, 2.0, 3.0, 4.0, 5.0)]
-    assert last_two_windows(history, 2, unit="updates") == (tuple(history[1:3]), tuple(history[3:]))
-    assert last_two_windows(history[:3], 2, unit="updates") is None
-
-
-def test_with_one_episode_an_update_windows_are_those_of_the_paper() -> None:
-    history = [of_costs(c) for c in (1.0, 2.0, 3.0, 4.0, 5.0)]
-    assert last_two_windows(history, 2, unit="episodes") == (tuple(history[1:3]), tuple(history[3:]))
+    assert last_two_windows(history, 2) == (tuple(history[1:3]), tuple(history[3:]))
+    assert last_two_windows(history[:3], 2) is None
 
 
 def test_a_window_grows_until_it_is_enough() -> None:
     history = [of_costs(c) for c in (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)]
-    windows = last_two_windows(history, 1, unit="updates", is_enough=lambda window: window.episodes >= 3)
+    windows = last_two_windows(history, 1, is_enough=lambda window: window.episodes >= 3)
     assert windows == (tuple(history[:3]), tuple(history[3:]))
-    assert last_two_windows(history[1:], 1, unit="updates", is_enough=lambda it: it.episodes >= 3) is None
+    assert last_two_windows(history[1:], 1, is_enough=lambda it: it.episodes >= 3) is None
 
 
 def test_windows_of_episodes_are_rounded_up_to_whole_updates() -> None:
+    def windows(*history: WindowStatistics) -> object:
+        return last_two_windows(history, 1, is_enough=lambda window: window.episodes >= 3)
+
     few, many = of_costs(1.0), of_costs(*[2.0] * 30)
-    assert last_two_windows([few, few, few, many], 3, unit="episodes") == ((few, few, few), (many,))
-    assert last_two_windows([many, many], 3, unit="episodes") == ((many,), (many,))
-    assert last_two_windows([few, few, many], 3, unit="episodes") is None
-
-
-def test_an_update_without_episodes_lends_its_steps_to_the_next() -> None:
-    history: tuple[WindowStatistics, ...] = ()
-    for update in (of_costs(), of_costs(), of_costs(5.0), of_costs()):
-        history = extend(history, update, unit="episodes")
-    assert [(statistics.env_steps, statistics.episodes) for statistics in history] == [(300, 1), (100, 0)]
-    assert len(extend(history, of_costs(), unit="updates")) == 3
+    assert windows(few, few, few, many) == ((few, few, few), (many,))
+    assert windows(many, many) == ((many,), (many,))
+    assert windows(few, few, many) is None
 
 
 def test_a_stretch_survives_json() -> None:
