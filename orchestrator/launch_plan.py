@@ -283,8 +283,9 @@ def _planned_action(record: TrialRecord, selection: TrialSelection) -> PlannedAc
     """Return the action for a trial that need not run again from its beginning.
 
     A complete trial is left alone, a failed one unless ``retry_failed`` is set. A damaged trial that had not
-    ended is repaired. One that had ended, or whose format is another version's, is left alone; with
-    ``rerun_damaged`` it is repaired, except while its files cannot be read. Others begin or continue.
+    ended is repaired. A damaged trial that had ended, or whose format is another version's, is left
+    alone; with ``rerun_damaged`` it is repaired, except while its files cannot be read. Others begin or
+    continue.
     """
     match record.status:
         case TrialStatus.COMPLETE:

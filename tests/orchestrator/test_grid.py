@@ -1,6 +1,7 @@
 """A grid file is checked whole: every mistake at once, each with its line; what is right is a product."""
 
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -520,9 +521,29 @@ RESULTS = {
 }
 
 
-@pytest.mark.parametrize("name", RESULTS)
+# Records of what was run, with options of `dynamic` that have been removed since.
+RECORDS = (
+    "rivergrid/ablation-teacher",
+    "rivergrid/all-episodes",
+    "safety-gym/overlapping-episodes",
+    "velocity/all-episodes",
+    "velocity/dynamic-noise",
+)
+REMOVED = "adherence_tolerance|clock_reset|overlapping_episodes|remaining|windows_after_noise"
+
+
+@pytest.mark.parametrize("name", sorted(set(RESULTS) - set(RECORDS)))
 def test_the_grids_of_our_results_are_right(name: str) -> None:
     assert read_grid(RESULTS[name]).trials()
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_a_record_has_removed_options_and_names_the_commit_at_which_it_runs(name: str) -> None:
+    with pytest.raises(GridError) as caught:
+        read_grid(RESULTS[name])
+    refused = rf".*: methods\.\d+\.options\.({REMOVED}): unknown key\b.*"
+    assert all(re.fullmatch(refused, problem) for problem in caught.value.problems)
+    assert re.search(r"^#   git checkout [0-9a-f]{7}$", RESULTS[name].read_text(), re.MULTILINE)
 
 
 @pytest.mark.parametrize("key", ["train_limits", "deploy_limits"])
