@@ -120,8 +120,7 @@ def _executed(state: TeacherState, report: ProgressReport) -> tuple[tuple[Window
     The steps of an update without episodes are added to the next one with some. So a history is never longer
     than its number of episodes.
     """
-    (saved,) = state.get("groups", [state])  # of an earlier version
-    history = tuple(map(WindowStatistics.from_json, saved["history"]))
+    history = tuple(map(WindowStatistics.from_json, state["history"]))
     latest = WindowStatistics.of_update(
         report.episodes,
         env_steps=report.env_steps - state["env_steps"],
@@ -129,7 +128,7 @@ def _executed(state: TeacherState, report: ProgressReport) -> tuple[tuple[Window
     )
     if history and history[-1].episodes == 0:
         history, latest = history[:-1], WindowStatistics.pooled([history[-1], latest])
-    return (*history, latest), int(saved["last_change"]) + len(report.episodes)
+    return (*history, latest), state["last_change"] + len(report.episodes)
 
 
 def episodes_left(last: WindowStatistics, *, env_steps: int, train_steps: int) -> int:

@@ -98,14 +98,14 @@ class _CostState:
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> _CostState:
         history = tuple(WindowStatistics.from_json(statistics) for statistics in values["history"])
-        return cls(int(values["last_change"]), int(values.get("changed_at", 0)), history)
+        return cls(int(values["last_change"]), int(values["changed_at"]), history)
 
 
 class DynamicTeacher:
     """The dynamic curriculum as a function of its state.
 
     Its state holds ``update``, ``env_steps``, ``limits`` [k], ``policy_noise``; ``longest`` (duration of the
-    longest episode so far, environment steps over all environments); ``groups`` (``_CostState`` of each cost,
+    longest episode so far, environment steps over all environments); ``costs`` (``_CostState`` of each cost,
     [k]) and the keys of ``StartMeasurement``.
 
     Args:
@@ -134,10 +134,10 @@ class DynamicTeacher:
         if already_seen(state, report):
             return CurriculumStep.from_json(state), state
         start = self.measurement.advance(state, report)
-        longest = max([state.get("longest", 0), *map(_duration, report.episodes)])
+        longest = max([state["longest"], *map(_duration, report.episodes)])
         costs = [
             self._extended(each, index, report, env_steps=state["env_steps"], longest=longest)
-            for index, each in enumerate(_costs(state))
+            for index, each in enumerate(map(_CostState.from_json, state["costs"]))
         ]
         before = CostLimits.from_json(state["limits"])
         limits = CostLimits(tuple(map(min, before, self.measurement.limits(start))))
@@ -209,17 +209,6 @@ class DynamicTeacher:
         return CurriculumStep(CostLimits(tuple(values)), noise if all_have_windows else 0.0)
 
 
-def _costs(state: TeacherState) -> list[_CostState]:
-    """Return the state of each cost, [k]; in a state of an earlier version all costs share one."""
-    if "groups" in state:
-        return [_CostState.from_json(values) for values in state["groups"]]
-    shared = _CostState.from_json(state)
-    return [
-        replace(shared, history=tuple(statistics.of_costs([index]) for statistics in shared.history))
-        for index in range(len(state["limits"]))
-    ]
-
-
 def _after(step: CurriculumStep, cost: _CostState, *, has_changed: bool, env_steps: int) -> _CostState:
     """Return a cost's state after a step: a change of its limit, or noise, restarts its clock."""
     is_noisy = step.policy_noise > 0.0
@@ -249,6 +238,6 @@ def _state(
         "limits": step.limits.to_json(),
         "policy_noise": step.policy_noise,
         "longest": longest,
-        "groups": [cost.to_json() for cost in costs],
+        "costs": [cost.to_json() for cost in costs],
         **start,
     }

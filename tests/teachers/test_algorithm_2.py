@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
 from recrl.teachers.algorithm_2 import Algorithm2Teacher, episodes_left
 from recrl.teachers.registry import make_teacher
-from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
+from recrl.teachers.teacher import ProgressReport, TeacherSpec
 from recrl.teachers.windows import WindowStatistics
 from tests.teachers.closed_loop import noises, obedient, play, recovering
 
@@ -190,22 +190,6 @@ def test_the_state_stays_small() -> None:
     for update in range(1, 50):
         _, state = teacher.step(state, ProgressReport(update, update, (episode(update, 9.0),) * 30))
     assert len(state["history"]) == 6  # two windows of 80 episodes
-
-
-def test_a_state_of_before_its_own_class_goes_on() -> None:
-    teacher = paper((50.0, 60.0), (5.0, 5.0), 1000, window=2)
-
-    def after(state: TeacherState, update: int) -> Any:
-        return teacher.step(state, ProgressReport(update, update, (episode(update, 50.0, 60.0),)))
-
-    _, state = teacher.start()
-    for update in range(1, 4):
-        _, state = after(state, update)
-    shared = {key: value for key, value in state.items() if key not in ("last_change", "history")}
-    group = {"last_change": state["last_change"], "changed_at": 0, "history": state["history"]}
-    step, _ = after(state, 4)
-    assert after({**shared, "longest": 7, "groups": [group]}, 4) == after(state, 4)
-    assert step.limits[0] < 50.0
 
 
 @pytest.mark.parametrize("name", ["return_floor", "cost_floor"])

@@ -252,7 +252,7 @@ def test_a_difficult_dimension_delays_an_easy_one_by_at_most_a_window() -> None:
 
 def test_the_state_stays_small() -> None:
     run = play(obedient, train=(250.0,), deploy=(5.0,), updates=100, episodes=lambda step: 100)
-    assert [group["history"] for group in run.state["groups"]] == [[]]
+    assert [cost["history"] for cost in run.state["costs"]] == [[]]
     teacher = make_teacher(
         TeacherSpec("dynamic", {}, CostLimits((250.0,)), CostLimits((5.0,)), train_steps=10**6)
     )
@@ -260,7 +260,7 @@ def test_the_state_stays_small() -> None:
     for update in range(1, 50):
         episodes = (EpisodeStats(0, Phase.TRAINING, update, 1, 1.0, (9.0,), CostLimits((9.0,)), 0.0),) * 30
         _, state = teacher.step(state, ProgressReport(update, update, episodes))
-    assert all(len(group["history"]) <= 10 for group in state["groups"])
+    assert all(len(cost["history"]) <= 10 for cost in state["costs"])
 
 
 def test_noise_is_not_judged_before_there_are_enough_episodes() -> None:
@@ -407,21 +407,6 @@ def test_a_cost_with_long_windows_is_not_held_up_by_one_with_short_windows(seed:
     assert noises >= 10
 
 
-def test_a_state_of_before_the_groups_goes_on() -> None:
-    spec = TeacherSpec("dynamic", {}, CostLimits((50.0, 60.0)), CostLimits((5.0, 5.0)), 1000)
-    teacher = make_teacher(spec)
-    _, state = teacher.start()
-    for update in range(1, 5):
-        episode = EpisodeStats(0, Phase.TRAINING, update, 1, 9.5, (50.0, 60.0), CostLimits((50.0, 60.0)), 0.0)
-        _, state = teacher.step(state, ProgressReport(update, update, (episode,)))
-    shared = {key: value for key, value in state.items() if key not in ("groups", "longest")}
-    record = [1, 1, 9.5, [50.0, 60.0], [0.0, 0.0], 0.0]
-    earlier = {**shared, "last_change": 4, "history": [record] * 4}
-    assert state["groups"][1]["history"] == [[1, 1, 9.5, [60.0], [0.0], 0.0]] * 4
-    report = ProgressReport(5, 5, ())
-    assert teacher.step(earlier, report) == teacher.step(state, report)
-
-
 # Episodes that began before a change.
 
 
@@ -520,7 +505,7 @@ def test_no_episode_counts_that_ends_within_the_longest_one_after_a_change() -> 
     _, state = reported(state, 1, 500, 250.0)
     step, state = reported(state, 2, 1500, 250.0)
     assert step.limits[0] < 250.0
-    assert state["groups"][0]["changed_at"] == 2000
+    assert state["costs"][0]["changed_at"] == 2000
     lowered = step.limits
     for length in (1500, 10):  # of before the change, and after it: a short one may be the cheap one
         ignored, unchanged = reported(state, 3, length, 0.0)
