@@ -6,6 +6,7 @@ paper's clock. Where Algorithm 2 is not defined, or not exactly:
 
 - *Several episodes per update.* ``last_change`` counts them all. A window has W episodes, rounded up to whole
   updates, because the policy is constant within one.
+- *Two windows* (line 4). At b = 2 W only 2 W - 1 episodes have run, so the first decision is at b = 2 W + 1.
 - *B - b*. The budget is in environment steps, so the remaining episodes are estimated (``episodes_left``).
 - *An old mean of 0* (line 5). |new / old - 1| <= eps is written as |new - old| <= eps |old|. So 0 after 0 has
   converged.

@@ -171,7 +171,7 @@ class DynamicTeacher:
         latest = WindowStatistics.of_update(
             counted, env_steps=report.env_steps - begin, num_costs=len(self.spec.train_limits)
         )
-        history = (*cost.history, latest.of_costs([index]))
+        history = (*cost.history, latest.of_cost(index))
         if windows := self._last_two(history):
             history = (*windows[0], *windows[1])
         return replace(cost, last_change=cost.last_change + 1, history=history)

@@ -80,13 +80,9 @@ class WindowStatistics:
         )
         return cls(env_steps, episodes, mean_return, mean_costs, cost_scatter, return_scatter)
 
-    def of_costs(self, group: Sequence[int]) -> WindowStatistics:
-        """Return the same statistics with some of the costs only."""
-        return replace(
-            self,
-            mean_costs=tuple(self.mean_costs[index] for index in group),
-            cost_scatter=tuple(self.cost_scatter[index] for index in group),
-        )
+    def of_cost(self, index: int) -> WindowStatistics:
+        """Return the same statistics with one of the costs only."""
+        return replace(self, mean_costs=(self.mean_costs[index],), cost_scatter=(self.cost_scatter[index],))
 
     @property
     def cost_spreads(self) -> tuple[float, ...]:
@@ -128,11 +124,11 @@ def latest_window(
     history: Sequence[WindowStatistics],
     size: int,
     *,
-    is_enough: Callable[[WindowStatistics], bool] | None = None,
+    is_enough: Callable[[WindowStatistics], bool],
 ) -> int | None:
     """Return how many of the last updates make a window; None if there are too few.
 
-    These are the last ``size`` updates. With ``is_enough`` a window includes more updates until it is true.
+    These are the last ``size`` updates, and more of them until ``is_enough`` is true.
 
     Args:
         history: statistics of each update, in order.
@@ -142,7 +138,7 @@ def latest_window(
     if len(history) < size:
         return None
     count, window = size, WindowStatistics.pooled(history[len(history) - size :])
-    while is_enough is not None and not is_enough(window):
+    while not is_enough(window):
         count += 1
         if count > len(history):
             return None
@@ -154,7 +150,7 @@ def last_two_windows(
     history: Sequence[WindowStatistics],
     size: int,
     *,
-    is_enough: Callable[[WindowStatistics], bool] | None = None,
+    is_enough: Callable[[WindowStatistics], bool],
 ) -> tuple[tuple[WindowStatistics, ...], tuple[WindowStatistics, ...]] | None:
     """Return the updates of the last two windows, the older one first; None if there are too few."""
     new = latest_window(history, size, is_enough=is_enough)

@@ -18,10 +18,10 @@ from recrl.analysis.report.figure_list import SKETCHED, Drawing, without_episode
 from recrl.analysis.report.html_page import Section
 from recrl.analysis.report.table_files import Tables
 from recrl.analysis.report.verdict_answers import answers, no_verdict
-from recrl.analysis.report.verdict_table import verdict_kinds, verdict_table
+from recrl.analysis.report.verdict_table import FAILED, verdict_kinds, verdict_table
 from recrl.analysis.report.verdict_terms import explanation, task_sentences
 from recrl.analysis.statistics.intervals import ENOUGH_RUNS
-from recrl.orchestrator.files.outcomes_file import FAILED, INFEASIBLE
+from recrl.orchestrator.files.outcomes_file import INFEASIBLE
 from recrl.orchestrator.spec import TrialStatus
 
 RELOAD_SECONDS = 120  # of the page of a sweep that runs

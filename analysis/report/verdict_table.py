@@ -7,11 +7,11 @@ import pandas as pd
 from recrl.analysis.data.number_texts import DASH, number, with_error
 from recrl.analysis.report.table_formats import with_interval
 from recrl.analysis.statistics.verdicts import costs_of, is_cost
-from recrl.orchestrator.files.outcomes_file import FAILED, FEASIBLE, INFEASIBLE, PENDING, SOLVED
+from recrl.orchestrator.files.outcomes_file import FEASIBLE, INFEASIBLE, SOLVED
 
 DEPLOYMENT = "deployment phase (learning goes on)"
 DIFFERENCE = "difference to none"
-UNEVALUATED = "not evaluated"
+FAILED, PENDING, UNEVALUATED = "failed", "no result yet", "not evaluated"
 WARNINGS = {
     "no_curriculum": (
         "curriculum without effect",

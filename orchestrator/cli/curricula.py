@@ -132,11 +132,14 @@ def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
         require_json(options)
         teacher_config(method.name, options)
     except ValidationError as error:
-        mistakes = (
-            f"{'.'.join(map(str, place))}: {sentence}"
-            for place, sentence in sentences(error, find_teacher(method.name).config)
-        )
-        raise RecrlError(f"--option: {method.name}: {'; '.join(mistakes)}") from error
+        mistakes = list(sentences(error, find_teacher(method.name).config))
+        text = "; ".join(f"{'.'.join(map(str, place))}: {sentence}" for place, sentence in mistakes)
+        if all(place and place[0] in method.options.keys() - changed.keys() for place, _ in mistakes):
+            raise RecrlError(
+                f"{method.label}: recorded with options that this version does not have ({text}); "
+                "replay it with the code of its commit"
+            ) from error
+        raise RecrlError(f"--option: {method.name}: {text}") from error
     except NotJsonError as error:
         raise RecrlError(f"--option: {error}") from error
     except UntrustedNameError as error:

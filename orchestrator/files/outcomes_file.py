@@ -8,4 +8,3 @@ from __future__ import annotations
 OUTCOMES_FILE = "outcomes.csv"  # in the sweep's figures folder
 VERDICT_MEASURE = "stochastic"  # value of its column ``measure`` in the rows that verdicts are made from
 SOLVED, FEASIBLE, INFEASIBLE = "solved", "feasible", "infeasible"
-FAILED, PENDING = "failed", "no result yet"

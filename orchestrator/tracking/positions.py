@@ -50,7 +50,8 @@ class Position:
 def read_position(path: Path) -> Position | None:
     """Return the position in a file; None if it is missing or invalid."""
     try:
-        position = Position(**json.loads(path.read_text()))
+        saved = json.loads(path.read_text())
+        position = Position(**{name: saved[name] for name in Position.__dataclass_fields__ if name in saved})
     except (OSError, ValueError, TypeError):
         return None
     kinds = (str, int, str, dict, dict)

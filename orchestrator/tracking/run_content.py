@@ -199,14 +199,16 @@ def note(name: str, counts: Mapping[str, int], *, charts: str, report: str, repo
         counts: number of trials by status: complete, running, ...
         charts: address of the page of charts.
         report: address of the report.
-        report_text: the report as Markdown; empty before it is drawn. Its first part, before any section,
-            has the answers and the verdicts.
+        report_text: the report as Markdown; empty if none has been drawn of these results. Its first part,
+            before any section, has the answers and the verdicts.
     """
     total = sum(counts.values())
     states = ", ".join(f"{count} {state}" for state, count in counts.items() if count) or "none yet"
     lines = [f"**{name}**: {total} trials ({states}). [Charts, seeds averaged]({charts})."]
     if report_text:
-        lines += [f"[Report]({report}); its figures are artifacts of this run."]
+        lines.append(f"[Report]({report}); its figures are artifacts of this run.")
+    else:
+        lines.append(f"No report of these results yet: `recrl-sweep figures {name}` draws it.")
     opening = report_text.split("\n## ", 1)[0].splitlines()[1:]  # without the title
     for line in opening:
         if sum(map(len, lines)) + len(lines) + len(line) > MAX_NOTE:

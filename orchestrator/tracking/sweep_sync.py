@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 
+from recrl.orchestrator.files.outcomes_file import OUTCOMES_FILE
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.sweep_progress import DisplayStatus, display_status, shown_record
@@ -86,10 +87,12 @@ class SweepSync:
         return replace(position, shown={**position.shown, "note": text, "status": status})
 
     def _report_text(self) -> str:
-        """Return the report as Markdown, or nothing before it is drawn."""
+        """Return the report as Markdown; nothing if there is none, or the policies were judged since."""
+        report, outcomes = (self._store.figures_folder / name for name in ("report.md", OUTCOMES_FILE))
         try:
-            return (self._store.figures_folder / "report.md").read_text(encoding="utf-8", errors="replace")
-        except FileNotFoundError:
+            is_older = outcomes.exists() and report.stat().st_mtime_ns < outcomes.stat().st_mtime_ns
+            return "" if is_older else report.read_text(encoding="utf-8", errors="replace")
+        except OSError:
             return ""
 
     def _save(self, position: Position) -> None:

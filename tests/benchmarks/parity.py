@@ -336,7 +336,7 @@ def main() -> int:
         )
     states, unequal = sum(one.states for one in compared), sum(not one.equal for one in compared)
     print(f"{len(compared)} episodes, {states} states: {unequal} differ (tolerance {TOLERANCE:g})")
-    steps = [(path.stem, errors) for path in files for errors in compare_steps(path)]
+    steps = [(path.stem.removeprefix("peer_"), errors) for path in files for errors in compare_steps(path)]
     for name, errors in steps:
         verdict = "" if errors.equal else "  differs"
         print(f"{name:14}one step: place {errors.place:.1e} m, velocity {errors.velocity:.1e}{verdict}")

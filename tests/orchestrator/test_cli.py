@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -30,7 +31,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.find_sweep import find_sweep
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid
-from recrl.orchestrator.spec import TrialStatus
+from recrl.orchestrator.spec import Choice, TrialStatus
 from recrl.orchestrator.trial import speed
 from recrl.orchestrator.trial.saved_policy import SavedTrial
 from recrl.orchestrator.trial.speed import measured_speed
@@ -897,6 +898,25 @@ def test_replay_draws_each_cost_of_the_tasks_that_have_it(
     capsys.readouterr()
     assert main(["replay", "small", "--teacher", "linear", "--only", "method=none"]) == ExitCode.OK
     assert capsys.readouterr().out.count("Figure ") == 2
+
+
+def test_replay_names_recorded_options_that_this_version_does_not_have(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
+    store = SweepStore(folder / "runs", "small")
+    old = [replace(spec, method=Choice("linear", {"slope": 2.0})) for spec in store.specs()]
+    store.write_specs(old)
+    capsys.readouterr()
+    assert main(["replay", "small", "--teacher", "linear"]) == ExitCode.WRONG_INPUT
+    error = capsys.readouterr().err
+    assert error.startswith(
+        "recrl-sweep: linear: recorded with options that this version does not have (slope: "
+    )
+    assert error.endswith("; replay it with the code of its commit\n")
+    asked = ["replay", "small", "--teacher", "linear", "--option", "slope=2"]
+    assert main(asked) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err.startswith("recrl-sweep: --option: linear: slope: ")
 
 
 def test_replay_leaves_out_a_trial_that_has_saved_nothing_yet(

@@ -41,6 +41,7 @@ from recrl.orchestrator.tracking.final_outcomes import (
     trial_note,
 )
 from recrl.orchestrator.tracking.mlflow_sync import sync
+from recrl.orchestrator.tracking.positions import Position, read_position
 from recrl.orchestrator.tracking.run_content import (
     final_points,
     note,
@@ -242,7 +243,10 @@ def test_the_note_has_the_progress_links_and_what_the_report_begins_with() -> No
         *REPORT.splitlines()[1:7],
     ]
     before = note("demo", counts, charts="#/charts", report="#/report", report_text="")
-    assert before.splitlines() == text.splitlines()[:1]
+    assert before.splitlines() == [
+        text.splitlines()[0],
+        "No report of these results yet: `recrl-sweep figures demo` draws it.",
+    ]
 
 
 def test_a_long_note_is_cut_where_mlflow_would_refuse_it() -> None:
@@ -547,7 +551,7 @@ def test_a_trial_that_is_damaged_before_it_is_shown_gets_its_params_when_mended(
     assert runs(store)[NONE].data.params.keys() == runs(store)[DYNAMIC].data.params.keys()
 
 
-def test_a_damaged_spec_takes_the_outcome_from_its_run_and_from_the_note(
+def test_a_damaged_spec_takes_the_outcome_from_its_run(
     write: Callable[..., SweepStore],
 ) -> None:
     store = write()
@@ -567,6 +571,14 @@ def test_a_damaged_spec_takes_the_outcome_from_its_run_and_from_the_note(
     trial.spec_path.write_bytes(whole)
     assert sync(SweepStore(store.folder.parent, store.name), uri).is_up_to_date
     assert runs(store)[NONE].data.tags["recrl.verdict"] == "solved"
+
+
+def test_a_position_of_an_earlier_version_is_read(tmp_path: Path) -> None:
+    """It had one more key."""
+    path = tmp_path / "position.json"
+    Position("run", 7, "row").write(path)
+    path.write_text(json.dumps({**json.loads(path.read_text()), "summary": {"summary/deploy_return": 1.0}}))
+    assert read_position(path) == Position("run", 7, "row")
 
 
 def test_rows_that_changed_in_a_byte_break_no_pass_off(write: Callable[..., SweepStore]) -> None:
@@ -726,6 +738,9 @@ def test_each_run_has_the_verdict_of_the_report(write: Callable[..., SweepStore]
     page = f"#/experiments/{parent.info.experiment_id}/runs/{parent.info.run_id}/artifacts"
     assert lines[1] == f"[Report]({page}/figures/report.html); its figures are artifacts of this run."
     assert sync(store, uri).points == 0
+    write_outcomes(store)  # newer than the report
+    sync(store, uri)
+    assert "river-a" not in runs(store)["made-up"].data.tags["mlflow.note.content"]
     sync(store, uri, rebuild=True)
     assert runs(store)[NONE].data.metrics["final/cost_0"] == 5.0
 

@@ -31,32 +31,39 @@ def episode(end: int, *costs: float, episode_return: float = 9.5) -> EpisodeStat
 
 
 def algorithm_2(
+    returns: list[float],
     costs: list[tuple[float, ...]],
     *,
     train: tuple[float, ...],
     deploy: tuple[float, ...],
     window: int,
-    tolerance: float,
+    tolerances: tuple[float, float],
 ) -> list[tuple[tuple[float, ...], bool]]:
     """The pseudocode of Algorithm 2, line by line: the limits and noise of every episode b.
 
     Args:
-        costs: C(b) of the episodes 1, ..., B, each [k]; every return is 1.
+        returns: r(b) of the episodes 1, ..., B, above 0.
+        costs: C(b) of these, each [k].
         train: d_t, [k].
         deploy: d_d, [k].
         window: W.
-        tolerance: eps_c.
+        tolerances: eps_r and eps_c.
     """
     budget, limits, last_change, taught = len(costs), train, 0, []  # line 2
     dimensions = range(len(train))
     for b in range(1, budget + 1):  # line 3
         noise = False
         if b > 2 * window and last_change >= window:  # line 4; at b = 2 W only 2 W - 1 are played
+            starts = (b - 1 - window, b - 1 - 2 * window)
             new, old = (
                 [math.fsum(c[i] for c in costs[start : start + window]) / window for i in dimensions]
-                for start in (b - 1 - window, b - 1 - 2 * window)
+                for start in starts
             )
-            if all(abs(new[i] / old[i] - 1.0) <= tolerance for i in dimensions):  # line 5
+            earned, before = (math.fsum(returns[start : start + window]) / window for start in starts)
+            eps_r, eps_c = tolerances
+            if abs(earned / before - 1.0) <= eps_r and all(
+                abs(new[i] / old[i] - 1.0) <= eps_c for i in dimensions
+            ):  # line 5
                 if all(new[i] <= limits[i] for i in dimensions):  # line 6
                     # line 7; at b = B it divides by 0, and d_d is meant
                     part = 1.0 / (budget - b) if b < budget else 1.0
@@ -82,15 +89,17 @@ def test_the_preset_paper_is_algorithm_2_episode_by_episode(seed: int, num_costs
             [round(float(cost * generator.uniform(0.95, 1.05)), 3) for cost in np.repeat(levels, 25)]
         )
     costs = list(zip(*columns, strict=True))
-    expected = algorithm_2(costs, train=train, deploy=deploy, window=5, tolerance=0.1)
+    returns = np.repeat(generator.uniform(5.0, 15.0, len(costs) // 10), 10).tolist()  # often not converged
+    expected = algorithm_2(returns, costs, train=train, deploy=deploy, window=5, tolerances=(0.2, 0.1))
     run = play(
-        lambda step, update: (1.0, costs[update - 1]),
+        lambda step, update: (returns[update - 1], costs[update - 1]),
         train=train,
         deploy=deploy,
         updates=len(costs),
         episodes=lambda step: 1,
         preset="paper",
         window=5,
+        return_tolerance=0.2,
     )
     taught = [(train, False), *zip(run.limits, (noise > 0.0 for noise in run.noise), strict=True)]
     for (limits, noise), (literal, literal_noise) in zip(taught[:-1], expected, strict=True):
@@ -190,6 +199,20 @@ def test_the_state_stays_small() -> None:
     for update in range(1, 50):
         _, state = teacher.step(state, ProgressReport(update, update, (episode(update, 9.0),) * 30))
     assert len(state["history"]) == 6  # two windows of 80 episodes
+
+
+def test_a_measured_start_begins_the_clock() -> None:
+    """The start is known after 10 of 100 updates; five updates, 80 episodes, later comes the first step."""
+    run = play(
+        lambda step, update: (9.5, (50.0,)),
+        train=(math.inf,),
+        deploy=(5.0,),
+        updates=100,
+        preset="paper",
+        start_fraction=0.1,
+    )
+    assert run.limits[:14] == [(math.inf,)] * 9 + [(50.0,)] * 5
+    assert run.limits[14][0] < 50.0
 
 
 @pytest.mark.parametrize("name", ["return_floor", "cost_floor"])

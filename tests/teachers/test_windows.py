@@ -43,8 +43,8 @@ def test_pooled_updates_are_one_update() -> None:
 
 def test_windows_of_updates_count_updates() -> None:
     history = [of_costs(c) for c in (1.0, 2.0, 3.0, 4.0, 5.0)]
-    assert last_two_windows(history, 2) == (tuple(history[1:3]), tuple(history[3:]))
-    assert last_two_windows(history[:3], 2) is None
+    assert last_two_windows(history, 2, is_enough=bool) == (tuple(history[1:3]), tuple(history[3:]))
+    assert last_two_windows(history[:3], 2, is_enough=bool) is None
 
 
 def test_a_window_grows_until_it_is_enough() -> None:
