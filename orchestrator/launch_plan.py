@@ -138,10 +138,10 @@ class Plan:
     @property
     def left_out_sentence(self) -> str:
         """Sentence on the trials that the grid no longer has; empty for none."""
+        if not self.orphans:
+            return ""
         number = counted(len(self.orphans), "trial")
-        return (
-            f"no longer in the grid: {number}, kept on disk and left out of results" if self.orphans else ""
-        )
+        return f"no longer in the grid: {number}, kept on disk and left out of results"
 
     @property
     def counts(self) -> Mapping[PlannedAction, int]:

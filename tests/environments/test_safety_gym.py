@@ -289,7 +289,7 @@ def test_an_unknown_task_or_option_is_refused() -> None:
         SafetyGymEnv("CarGoal1", lidar_bins=10)
 
 
-@pytest.mark.parametrize("name", [*LEVEL_2, "PointGoal2", "PointPush2"])
+@pytest.mark.parametrize("name", [*LEVEL_2, "PointButton2", "PointGoal2", "PointPush2"])
 def test_what_a_robot_touches_is_what_mujoco_has_in_contact_with_it(name: str) -> None:
     environment = SafetyGymVectorEnv(name, 4)
     environment.reset(seed=7)
@@ -327,6 +327,19 @@ def test_a_pillar_costs_one_while_the_robot_touches_it_and_nothing_else(name: st
     assert costs[0] == free
     assert costly in costs
     assert all(each in (free, costly) for each in costs)
+
+
+@pytest.mark.parametrize("name", ["CarButton2", "PointButton2"])
+def test_a_gremlin_costs_one_while_the_robot_touches_it(name: str) -> None:
+    environment = SafetyGymVectorEnv(name, 16)
+    environment.reset(seed=0)
+    gremlins, costs = environment.batch.scene.touchable["gremlins"], set()
+    for action in held_actions(300, 16, seed=2):
+        *_, info = environment.step(action)
+        touched = environment.batch.touching[:, gremlins].any(axis=1)
+        assert info["cost_gremlins"].tolist() == touched.astype(float).tolist()
+        costs |= set(info["cost_gremlins"].tolist())
+    assert costs == {0.0, 1.0}
 
 
 def test_robots_cannot_tell_that_gremlins_far_away_are_no_bodies(monkeypatch: pytest.MonkeyPatch) -> None:
