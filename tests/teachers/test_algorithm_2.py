@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from recrl.environments.cmdp import CostLimits, EpisodeStats, Phase
+from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.teachers.algorithm_2 import Algorithm2Teacher, episodes_left
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec
 from recrl.teachers.windows import WindowStatistics
-from tests.teachers.closed_loop import noises, obedient, play, recovering
+from tests.teachers.closed_loop import Agent, Run, noises, obedient, play, recovering
 
 
 def paper(
@@ -28,6 +28,11 @@ def paper(
 
 def episode(end: int, *costs: float, episode_return: float = 9.5) -> EpisodeStats:
     return EpisodeStats(0, Phase.TRAINING, end, 1, episode_return, costs, CostLimits(costs), 0.0)
+
+
+def play_paper(agent: Agent, **settings: Any) -> Run:
+    """A closed loop of Algorithm 2 with one episode an update, which is the paper's clock."""
+    return play(agent, episodes=lambda step: 1, preset="paper", **settings)
 
 
 def algorithm_2(
@@ -79,7 +84,7 @@ def algorithm_2(
 @pytest.mark.parametrize("num_costs", [1, 2])
 @pytest.mark.parametrize("seed", range(8))
 def test_the_preset_paper_is_algorithm_2_episode_by_episode(seed: int, num_costs: int) -> None:
-    """Costs that stand still, jump and fall, also below d_d, where nothing changes and line 11 resets."""
+    """Costs that stay, jump and fall, also below d_d, where nothing changes and line 11 resets."""
     generator = np.random.default_rng(seed)
     train, deploy = (60.0, 70.0)[:num_costs], (20.0, 30.0)[:num_costs]
     columns = []
@@ -91,13 +96,11 @@ def test_the_preset_paper_is_algorithm_2_episode_by_episode(seed: int, num_costs
     costs = list(zip(*columns, strict=True))
     returns = np.repeat(generator.uniform(5.0, 15.0, len(costs) // 10), 10).tolist()  # often not converged
     expected = algorithm_2(returns, costs, train=train, deploy=deploy, window=5, tolerances=(0.2, 0.1))
-    run = play(
+    run = play_paper(
         lambda step, update: (returns[update - 1], costs[update - 1]),
         train=train,
         deploy=deploy,
         updates=len(costs),
-        episodes=lambda step: 1,
-        preset="paper",
         window=5,
         return_tolerance=0.2,
     )
@@ -114,15 +117,7 @@ def test_the_steps_leave_an_ideal_agent_far_above_d_d() -> None:
 
     Episode b = 21, 31, ... is the one about to be played when 20, 30, ... are.
     """
-    run = play(
-        obedient,
-        train=(250.0,),
-        deploy=(25.0,),
-        updates=1000,
-        episodes=lambda step: 1,
-        preset="paper",
-        window=10,
-    )
+    run = play_paper(obedient, train=(250.0,), deploy=(25.0,), updates=1000, window=10)
     factors = [1.0 - 1.0 / (1000 - b) for b in range(21, 1000, 10)]
     assert run.limits[-2][0] == pytest.approx(25.0 + 225.0 * math.prod(factors))
     assert run.limits[-2][0] > 150.0
@@ -131,16 +126,11 @@ def test_the_steps_leave_an_ideal_agent_far_above_d_d() -> None:
 
 def test_line_11_resets_the_clock_also_where_nothing_changes() -> None:
     """At d_d line 7 changes nothing, so a jump at episode 13 is answered one window after the last test."""
-    run = play(
-        lambda step, update: (9.5, (5.0 if update <= 12 else 7.0,)),
-        train=(5.0,),
-        deploy=(5.0,),
-        updates=60,
-        episodes=lambda step: 1,
-        preset="paper",
-        window=4,
-        cost_tolerance=0.5,
-    )
+
+    def jumps(step: CurriculumStep, update: int) -> tuple[float, tuple[float, ...]]:
+        return 9.5, (5.0 if update <= 12 else 7.0,)
+
+    run = play_paper(jumps, train=(5.0,), deploy=(5.0,), updates=60, window=4, cost_tolerance=0.5)
     assert next(update for update, noise in enumerate(run.noise, start=1) if noise > 0.0) == 16
 
 
@@ -168,15 +158,7 @@ def test_all_limits_wait_for_the_last_cost() -> None:
 
 @pytest.mark.parametrize(("cost", "noise"), [(5.0, 0.0), (5.0 + 1e-12, 0.0), (5.01, 0.3)])
 def test_a_mean_cost_may_not_exceed_its_limit(cost: float, noise: float) -> None:
-    run = play(
-        lambda step, update: (9.5, (cost,)),
-        train=(5.0,),
-        deploy=(5.0,),
-        updates=9,
-        episodes=lambda step: 1,
-        preset="paper",
-        window=2,
-    )
+    run = play_paper(lambda step, update: (9.5, (cost,)), train=(5.0,), deploy=(5.0,), updates=9, window=2)
     assert run.noise[3] == noise
 
 
