@@ -4,7 +4,7 @@
 
 From table.zip (``ppo-lag``) and table-cpo.zip come the rows of final policies and of the deployment phase,
 the differences from ``none``, the claims and the figures; from these rows and those of other experiments the
-power. The controls and the confirmation have their own archives. Printed are the rows of the pages' tables.
+power. The controls and the confirmation have their own archives. The tables are written into the pages.
 """
 
 from __future__ import annotations
@@ -15,31 +15,34 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 from PIL import Image
 
 import recrl
 from recrl.orchestrator.cli.main import main as recrl_sweep
+from tests.benchmarks import safety_gym_pages
 from tests.benchmarks.differences import paired_differences
-from tests.benchmarks.velocity_table import Cell, number
+from tests.benchmarks.safety_gym_pages import (
+    CONTROLS,
+    FRESH,
+    MULTIPLIERS,
+    NOISE,
+    PILOT,
+    POLICIES,
+    RESULTS,
+    ROOT,
+    STEPS_UNDER_LIMIT,
+    of_policy,
+    of_question,
+    rows_of,
+)
 
-ROOT = Path(__file__).parents[2]
-RESULTS = ROOT / "results" / "safety-gym"
 COLOURS = 128  # of a figure in the documentation
 TABLE_PARTS = ("table", "table-cpo")  # one archive would be too large for the repository
-CONTROLS = ("controls", "early-landing", "short-training")  # with rows of the deployment phase, as the table
-STEPS_UNDER_LIMIT = ("none", "none-short", "linear", "linear-early")  # differ in these on CarGoal2
-NOISE = ("none", "dynamic", "dynamic-without-noise")
-CURRICULA = (*STEPS_UNDER_LIMIT, "cosine", "exponential", *NOISE[1:], "step")
-PERIODS = ("phase", "first", "last")
-POLICIES = ("stochastic", "deterministic")
 PERIOD = 250_000  # steps, of a curve
-AGENTS = ("ppo-lag", "cpo")
 LABELS = ("ppo-lag min-std", "cpo")  # of each agent in the tables for the power
-PILOT = ("curricula-today.csv", "cpo-curricula.csv")
-COUNTED = ("agents.csv", *PILOT, "margin-control.csv", "table.csv", "button-confirm.csv")  # for the power
+COUNTED = ("agents.csv", *PILOT, "margin-control.csv", FRESH, "button-confirm.csv")  # for the power
 
 
 def transcript(commands: Sequence[str], folder: Path = RESULTS) -> str:
@@ -78,7 +81,7 @@ def write_rows_and_tests(archives: Mapping[str, Path]) -> None:
     powers = [
         f"tests/benchmarks/power.py {tables} --agents {labels} --tests {tests} --difference 1"
         for labels in LABELS
-        for tests in (1, 18, 24)  # those of the answer page, and of the paper's table
+        for tests in (1, 24)
     ]
     (RESULTS / "power.txt").write_text(transcript(powers, ROOT))
     earlier = f"results/safety-gym/{PILOT[0]} results/safety-gym/table.csv"
@@ -98,56 +101,13 @@ def draw(table: Path) -> None:
             image.save(ROOT / "docs/_static" / f"safety-gym-table-{figure.name}", optimize=True)
 
 
-def policy_table(rows: pd.DataFrame) -> Iterator[str]:
-    """Yield the lines of the table of final policies, a column a seed."""
-    seeds = sorted(rows["seed"].unique())
-    yield "| task | agent | policy | curriculum | " + " | ".join(f"seed {it}" for it in seeds) + " | mean |"
-    yield "|---" * (5 + len(seeds)) + "|"
-    ordered = rows.assign(
-        policy=pd.Categorical(rows["policy"], POLICIES), method=pd.Categorical(rows["method"], CURRICULA)
-    )
-    keys = ["task", "agent", "policy", "method"]
-    for (task, agent, policy, method), group in ordered.groupby(keys, observed=True):
-        cell = Cell.of(str(task), str(agent), group)
-        of_seed = group.set_index("seed")[["return", "cost"]].map("{:.1f}".format).agg(" / ".join, axis=1)
-        mean = f"{cell.interval} / {costs_of(cell)}"
-        each = [str(text) for text in of_seed.reindex(seeds, fill_value="")]
-        yield f"| {task} | `{agent}` | {policy} | `{method}` | {' | '.join([*each, mean])} |"
-
-
-def answer_table(rows: pd.DataFrame) -> Iterator[str]:
-    """Yield the lines of the table of answers: stochastic policies, and differences from none."""
-    ordered = rows.assign(agent=pd.Categorical(rows["agent"], AGENTS))
-    stochastic = ordered[ordered["policy"] == "stochastic"]
-    differences = paired_differences(stochastic.astype({"agent": str}), "none", "return")
-    texts = {tuple(row[["agent", "task", "method"]]): shown(row) for _, row in differences.iterrows()}
-    for (agent, task), of_cell in stochastic.groupby(["agent", "task"], observed=True):
-        none = mean_cell(of_cell, "none")
-        yield f"| `{agent}` | {task} | `none` | {seeds_of(of_cell, 'none')} | {none} | |"
-        for method in CURRICULA:
-            if text := texts.get((agent, task, method)):
-                cells = f"{seeds_of(of_cell, method)} | {mean_cell(of_cell, method)}"
-                yield f"| `{agent}` | {task} | `{method}` | {cells} | {text} |"
-
-
-def seeds_of(rows: pd.DataFrame, method: str) -> int:
-    """Return the number of seeds of one task and agent under a curriculum."""
-    return int((rows["method"] == method).sum())
-
-
-def of_question(rows: pd.DataFrame, methods: Sequence[str]) -> pd.DataFrame:
-    """Return the rows of ppo-lag on CarGoal2 under some curricula."""
-    chosen = (rows["task"] == "CarGoal2") & (rows["agent"] == "ppo-lag")
-    return rows[chosen & rows["method"].isin(methods)]
-
-
 def control_differences(rows: pd.DataFrame, baselines: Sequence[str]) -> Iterator[str]:
     """Yield what policies earn and cost above those of each baseline; they ran on several machines."""
     for policy in POLICIES:
-        of_policy = rows[rows["policy"] == policy]
+        chosen = of_policy(rows, policy)
         for column in ("return", "cost"):
             for baseline in baselines:
-                table = paired_differences(of_policy, baseline, column, as_groups=True).drop(columns="p_holm")
+                table = paired_differences(chosen, baseline, column, as_groups=True).drop(columns="p_holm")
                 yield f"{policy}, {column} above {baseline}, two groups: 95% interval, p (not corrected)"
                 yield table.round(3).to_string(index=False)
 
@@ -160,76 +120,15 @@ def curve(updates: pd.DataFrame) -> pd.DataFrame:
     return means.round(2).reset_index()
 
 
-def mean_cell(rows: pd.DataFrame, method: str) -> str:
-    """Return the mean return / cost of one task and agent under a curriculum."""
-    cell = Cell.of("", "", rows[rows["method"] == method])
-    return f"{cell.episode_return:.1f} / {costs_of(cell)}"
-
-
-def costs_of(cell: Cell) -> str:
-    """Return the mean cost with its error, for a page."""
-    return cell.costs.replace("+-", "±")
-
-
-def landing_table(
-    final: pd.DataFrame, phase: pd.DataFrame, updates: pd.DataFrame, methods: Sequence[str]
-) -> Iterator[str]:
-    """Yield the lines of a table of ppo-lag: deployment phase, final policies, multipliers."""
-    final, phase, updates = (rows[rows["agent"] == "ppo-lag"] for rows in (final, phase, updates))
-    for task in ("CarGoal2", "CarButton2"):
-        for method in methods:
-            of_phase, of_final, run = (
-                rows[(rows["task"] == task) & (rows["method"] == method)] for rows in (phase, final, updates)
-            )
-            if of_phase.empty:
-                continue
-            means = of_phase.loc[of_phase["policy"] == "phase", ["return", "cost"]].mean()
-            deployed = run[run["phase"] == "deployment"]
-            multipliers = deployed.groupby("seed")["multiplier_0"].agg(["first", "last"]).mean()
-            cells = [
-                f"{means['return']:.1f} / {means['cost']:.1f}",
-                mean_cell(of_final[of_final["policy"] == "stochastic"], method),
-                f"{multipliers['first']:.2f}, {multipliers['last']:.2f}",
-            ]
-            yield f"| {task} | `{method}` | {' | '.join(cells)} |"
-
-
-def shown(row: pd.Series[Any]) -> str:
-    """Return a difference with its interval and its corrected p value."""
-    mean, low, high = (number(row[name]) for name in ("return", "low", "high"))
-    return f"{mean} ({low} to {high}), p = {row['p_holm']:.2g}"
-
-
-def difference_table(fresh: pd.DataFrame, seen: pd.DataFrame) -> Iterator[str]:
-    """Yield the lines of the table of differences in return from ``none``, without and with the pilot."""
-    yield "| task | agent | policy | curriculum | three fresh seeds | with the pilot |"
-    yield "|---" * 6 + "|"
-    keys = ["task", "agent", "method"]
-    for policy in POLICIES:
-        tables = [
-            paired_differences(rows[rows["policy"] == policy], "none", "return").set_index(keys)
-            for rows in (fresh, pd.concat([seen, fresh]))
-        ]
-        for key in tables[0].index:
-            texts = [shown(table.loc[key]) for table in tables]
-            yield f"| {key[0]} | `{key[1]}` | {policy} | `{key[2]}` | {' | '.join(texts)} |"
-
-
-def phase_table(rows: pd.DataFrame) -> Iterator[str]:
-    """Yield the lines of the table of the deployment phase, means over the seeds."""
-    yield "| task | agent | curriculum | whole phase | first 100,000 steps | last 100,000 steps |"
-    yield "|---" * 6 + "|"
-    for (task, agent), of_agent in rows.groupby(["task", "agent"]):
-        means = of_agent.groupby(["method", "policy"])[["return", "cost"]].mean()
-        cells = means.apply(lambda it: f"{it['return']:.1f} / {it['cost']:.1f}", axis=1).unstack()
-        for method in CURRICULA:
-            if method in cells.index:
-                texts = " | ".join(str(cells.loc[method, period]) for period in PERIODS)
-                yield f"| {task} | `{agent}` | `{method}` | {texts} |"
+def multipliers(updates: pd.DataFrame) -> pd.DataFrame:
+    """Return those of the first and the last update of the deployment phase, a row a trial of ppo-lag."""
+    deployed = updates[(updates["phase"] == "deployment") & (updates["agent"] == "ppo-lag")]
+    keys = ["agent", "task", "method", "seed"]
+    return deployed.groupby(keys, observed=True)["multiplier_0"].agg(["first", "last"]).reset_index()
 
 
 def main() -> None:
-    """Write the files, and print the page's tables."""
+    """Write the files, the figures and the tables of the pages."""
     with tempfile.TemporaryDirectory() as folder:
         whole = Path(folder) / "table.zip"
         if code := recrl_sweep(["merge", *map(str, map(archive_of, TABLE_PARTS)), "--to", str(whole)]):
@@ -238,34 +137,19 @@ def main() -> None:
         write_rows_and_tests(archives)
         draw(whole)
         updates = pd.concat(recrl.load_sweep(path).updates for path in archives.values())
-    finals = [pd.read_csv(RESULTS / f"{name}.csv") for name in archives]
-    fresh = finals[0]
-    seen = pd.concat(pd.read_csv(RESULTS / name) for name in PILOT)
-    phases = [pd.read_csv(RESULTS / f"{name}-deployment-phase.csv") for name in archives]
-    everything = pd.concat(finals), pd.concat(phases), updates
-    by_steps = of_question(pd.concat([seen, *finals]), STEPS_UNDER_LIMIT)
-    by_noise = of_question(everything[0], NOISE)
+    multipliers(updates).round(4).to_csv(RESULTS / MULTIPLIERS, index=False)
+    controls = [f"{name}.csv" for name in CONTROLS]
     questions = (
-        ("steps-under-limit", by_steps, ("none", "linear")),
-        ("noise", by_noise, ("none", "dynamic")),
+        ("steps-under-limit", rows_of(*PILOT, FRESH, *controls), STEPS_UNDER_LIMIT, ("none", "linear")),
+        ("noise", rows_of(FRESH, *controls), NOISE, ("none", "dynamic")),
     )
-    for name, rows, baselines in questions:
-        lines = control_differences(rows, baselines)
+    for name, rows, methods, baselines in questions:
+        lines = control_differences(of_question(rows, methods), baselines)
         (RESULTS / f"{name}.txt").write_text("\n".join([*lines, ""]))
     curve(of_question(updates, STEPS_UNDER_LIMIT)).to_csv(
         RESULTS / "steps-under-limit-curve.csv", index=False
     )
-    tables = (
-        policy_table(fresh),
-        difference_table(fresh, seen),
-        phase_table(phases[0]),
-        answer_table(pd.concat([seen, fresh])),
-        landing_table(*everything, CURRICULA),
-        policy_table(by_steps),
-        policy_table(by_noise),
-    )
-    for table in tables:
-        print("\n" + "\n".join(table))
+    safety_gym_pages.main()
 
 
 if __name__ == "__main__":
