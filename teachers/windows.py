@@ -128,7 +128,8 @@ def latest_window(
 ) -> int | None:
     """Return how many of the last updates make a window; None if there are too few.
 
-    These are the last ``size`` updates, and more of them until ``is_enough`` is true.
+    These are the last ``size`` updates, and more of them until ``is_enough`` is true. Updates in which no
+    episode finished make no difference to it, so they are passed over.
 
     Args:
         history: statistics of each update, in order.
@@ -137,12 +138,13 @@ def latest_window(
     """
     if len(history) < size:
         return None
-    count, window = size, WindowStatistics.pooled(history[len(history) - size :])
+    count, window = size, WindowStatistics.pooled(history[-size:])
     while not is_enough(window):
-        count += 1
-        if count > len(history):
+        longer = next((n for n in range(count + 1, len(history) + 1) if history[-n].episodes), None)
+        if longer is None:
             return None
-        window = WindowStatistics.pooled([history[len(history) - count], window])
+        window = WindowStatistics.pooled([*history[-longer:-count], window])
+        count = longer
     return count
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import pytest
@@ -215,6 +216,16 @@ def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
         path = Path(f"{store.mlflow_database}{pragma}")
         assert path.exists() == (pragma == "")
     return store.mlflow_database
+
+
+@pytest.fixture
+def unrendered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are made but not rendered, which takes a second each: for tests of the files beside them."""
+
+    def write(figure: object, file: BinaryIO, **options: object) -> None:
+        file.write(b"not rendered")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", write)
 
 
 @pytest.fixture(autouse=True)

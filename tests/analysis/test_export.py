@@ -125,6 +125,7 @@ def of_another_version(made_up_sweep: Callable[..., SweepStore]) -> Sweep:
     return sweep_data.assemble(sweep.name, facts, {name: sweep.rows(name) for name in sweep_data.ROWS})
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_options_of_another_version_cost_no_more_than_what_is_computed_from_them(
     of_another_version: Sweep, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

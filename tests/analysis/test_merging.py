@@ -160,6 +160,7 @@ def test_each_agent_has_its_own_discount_in_the_bounds(part: Part) -> None:
     assert alone[0] != alone[1]
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_task_of_another_number_of_costs_under_one_label_is_drawn(part: Part, tmp_path: Path) -> None:
     merged = merge([part("two", num_costs=2), part("one")])
     numbers = merged.trials.groupby("task", observed=True)["num_costs"].unique()

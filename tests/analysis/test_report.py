@@ -153,6 +153,7 @@ def test_trials_without_an_evaluation_are_not_said_to_be_incomplete(finished: Sw
         assert no_verdict(dataclasses.replace(finished, trials=trials)) == sentence
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_report_of_failed_trials_alone_says_so(finished: Sweep, tmp_path: Path) -> None:
     failed = dataclasses.replace(finished, trials=finished.trials.assign(status="failed"))
     drawing.draw(failed, tmp_path)

@@ -207,6 +207,7 @@ def test_the_main_walk(folder: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert main(["figures", "small", "--sketch"]) == ExitCode.OK
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_mistake_in_a_figure_keeps_nobody_from_the_results(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -226,6 +227,7 @@ def test_a_mistake_in_a_figure_keeps_nobody_from_the_results(
         main(["figures", "small", "--root", "elsewhere"])
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_full_disk_while_figures_are_drawn_ends_no_launch(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -393,6 +393,7 @@ def test_the_imports_of_a_plug_in_are_followed_within_its_project_and_bounds(
     assert list(InstalledCode().of(spec)) == ["recrl", "my_scaled_task", "my_a"]
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_of_a_package_that_is_not_here_it_is_said_that_it_was_not_compared(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -415,6 +416,7 @@ def test_of_a_package_that_is_not_here_it_is_said_that_it_was_not_compared(
     assert sentence in pages.missing(sweep_data.load(store))
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_changed_module_of_the_working_directory_is_found_without_trust(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -93,6 +93,7 @@ def foreign(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
     ],
     ids=" ".join,
 )
+@pytest.mark.usefixtures("unrendered")
 def test_reading_runs_nothing_that_a_file_names(foreign: Path, command: list[str]) -> None:
     main(command)
     assert not (foreign / "RUN").exists()
@@ -107,6 +108,7 @@ def test_trust_runs_it(foreign: Path, command: list[str]) -> None:
     assert (foreign / "RUN").exists()
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_what_was_not_called_is_said(foreign: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sentence = f"grid.yaml: tasks.0 (spy:TASK) was not called, {REFUSED}; if you trust it, add --trust"
     assert main(["validate", "grid.yaml"]) == ExitCode.OK
@@ -297,6 +299,7 @@ def test_no_file_of_a_trial_is_written_through_a_link(foreign: Path, name: str) 
     assert (foreign / "diary.txt").read_text() == "mine"
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_no_figure_or_table_is_written_through_a_link(foreign: Path) -> None:
     (foreign / "diary.txt").write_text("mine")
     assert main(["figures", "small", "--to", "drawn"]) == ExitCode.OK
@@ -335,6 +338,7 @@ def test_no_label_costs_a_figure(foreign: Path, label: str) -> None:
     assert "could not be drawn" not in (foreign / "drawn" / "report.md").read_text()
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_one_figure_that_cannot_be_drawn_costs_no_other_and_is_named(
     foreign: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

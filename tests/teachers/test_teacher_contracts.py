@@ -253,23 +253,25 @@ def test_a_static_limit_depends_on_its_own_dimension_only(history: History) -> N
 
 @CONTRACT
 @given(
+    options=st.sampled_from(
+        [options for name, options in VARIANTS if name == "dynamic" and "preset" not in options]
+    ),
     deploy=st.sampled_from([0.0, 1.0, 40.0]),
     other_train=st.sampled_from([math.inf, 50.0, 0.0]),
     other_costs=st.lists(st.sampled_from([0.0, 3.0, 40.0]), min_size=1, max_size=12),
 )
 def test_no_dimension_keeps_an_obedient_one_from_d_d(
-    deploy: float, other_train: float, other_costs: list[float]
+    options: dict[str, Any], deploy: float, other_train: float, other_costs: list[float]
 ) -> None:
     """A dimension always costs what it may; what the other costs, over and over again, is arbitrary."""
     limits = CostLimits((50.0, other_train)), CostLimits((deploy, 0.0))
-    for options in (options for name, options in VARIANTS if name == "dynamic" and "preset" not in options):
-        teacher = make_teacher(TeacherSpec("dynamic", options, *limits, TRAIN_STEPS))
-        step, state = teacher.start()
-        for update, other in zip(range(1, TRAIN_STEPS), cycle(other_costs), strict=False):
-            costs = (step.limits[0], other)
-            episode = EpisodeStats(update, Phase.TRAINING, update, 1, 9.5, costs, step.limits, 0.0)
-            step, state = teacher.step(state, ProgressReport(update, update, (episode,)))
-        assert step.limits[0] == deploy
+    teacher = make_teacher(TeacherSpec("dynamic", options, *limits, TRAIN_STEPS))
+    step, state = teacher.start()
+    for update, other in zip(range(1, TRAIN_STEPS), cycle(other_costs), strict=False):
+        costs = (step.limits[0], other)
+        episode = EpisodeStats(update, Phase.TRAINING, update, 1, 9.5, costs, step.limits, 0.0)
+        step, state = teacher.step(state, ProgressReport(update, update, (episode,)))
+    assert step.limits[0] == deploy
 
 
 @pytest.mark.parametrize("name", TEACHERS)
