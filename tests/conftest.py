@@ -28,6 +28,9 @@ from recrl.orchestrator.tracking.mlflow_sync import sync
 settings.register_profile("recrl", deadline=None)  # a loaded machine is no failure
 settings.load_profile("recrl")
 
+# They take a minute or more each, and begin first: at the end one process would wait for the other.
+SLOW_FILES = ("test_docs_commands.py", "test_ray_services.py", "test_ray_executor.py", "test_learning.py")
+
 STEPS_PER_UPDATE = 400
 FIRST_COST = 100.0
 # How the made-up agents end: return and cost without a curriculum, and with one.
@@ -182,6 +185,11 @@ def _limit(spec: TrialSpec, progress: float, pace: float) -> float:
         "unconstrained": math.inf if progress < 1.0 else 0.0,
     }.get(spec.method.label, 0.5 if progress < 1.0 else 0.0)
     return end + share * (start - end)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Order the tests; pytest calls this."""
+    items.sort(key=lambda item: item.path.name not in SLOW_FILES)
 
 
 @pytest.fixture
