@@ -13,6 +13,7 @@ from typing import Any
 
 import pandas as pd
 
+from recrl.analysis.statistics.intervals import wilson_interval
 from tests.benchmarks.differences import paired_differences
 from tests.benchmarks.page_tables import replace_table
 from tests.benchmarks.velocity_table import Cell, number
@@ -27,6 +28,7 @@ PILOT = ("curricula-today.csv", "cpo-curricula.csv")
 FRESH = "table.csv"
 FRESH_PHASE = "table-deployment-phase.csv"
 MULTIPLIERS = "multipliers.csv"  # of ppo-lag, in the first and the last update of the deployment phase
+CLAIMS = "table-claims.csv"
 CONTROLS = ("controls", "early-landing", "short-training")  # with rows of the deployment phase, as the table
 AGENTS = ("ppo-lag", "cpo")
 TASKS = ("CarGoal2", "CarButton2", "CarPush2")
@@ -162,6 +164,21 @@ def step_control(final: pd.DataFrame, phase: pd.DataFrame, multipliers: pd.DataF
             yield f"| {task} | `{method}` | {means} | {mean_of(ended)} | {moved} |"
 
 
+def claims(rows: pd.DataFrame) -> Iterator[str]:
+    """Yield the table of the paper's claims: in how many pairs of seeds, over the tasks, each holds."""
+    yield "| agent | claim | the paper's gain | final policies | deployment phase |"
+    yield "|---" * 5 + "|"
+    text = rows["claim"].str.replace(r" on Car\w+", "", regex=True)
+    for (claim, agent), of_claim in rows.groupby([text, "agent"], sort=False):
+        counts = of_claim[["held", "seeds", "deployment_held", "deployment_seeds"]].sum()
+        held, seeds, deployed, deployed_seeds = map(int, counts)
+        interval = wilson_interval(held, seeds)
+        share = f"{held} of {seeds} ({interval.low:.0%} to {interval.high:.0%})"
+        in_phase = f"{deployed} of {deployed_seeds}" if deployed_seeds else ""
+        gain = of_claim["paper"].fillna("").iloc[0]
+        yield f"| `{agent}` | {str(claim).removeprefix(f'{agent} ')} | {gain} | {share} | {in_phase} |"
+
+
 def tables() -> Iterator[tuple[Path, str, list[str]]]:
     """Yield the page, the name and the lines of each table."""
     controls = [f"{it}.csv" for it in CONTROLS]
@@ -174,6 +191,7 @@ def tables() -> Iterator[tuple[Path, str, list[str]]]:
         (ANSWERS, "step", step_control(current, rows_of(FRESH_PHASE, *phases), rows_of(MULTIPLIERS))),
         (DETAILS, "fresh seeds", policies(fresh)),
         (DETAILS, "other differences", other_differences(fresh, seen)),
+        (DETAILS, "claims", claims(pd.read_csv(RESULTS / CLAIMS))),
         (DETAILS, "pilot", policies(seen)),
         (DETAILS, "deployment phase", deployment_phase(phase)),
         (DETAILS, "steps under the limit", policies(of_question(everything, STEPS_UNDER_LIMIT))),

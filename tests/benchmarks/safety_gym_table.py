@@ -24,6 +24,7 @@ from recrl.orchestrator.cli.main import main as recrl_sweep
 from tests.benchmarks import safety_gym_pages
 from tests.benchmarks.differences import paired_differences
 from tests.benchmarks.safety_gym_pages import (
+    CLAIMS,
     CONTROLS,
     FRESH,
     MULTIPLIERS,
@@ -95,7 +96,7 @@ def draw(table: Path) -> None:
         folder = Path(name)
         if code := recrl_sweep(["figures", str(table), "--to", name]):
             raise SystemExit(code)
-        (RESULTS / "table-claims.csv").write_bytes((folder / "claims.csv").read_bytes())
+        (RESULTS / CLAIMS).write_bytes((folder / "claims.csv").read_bytes())
         for figure in [folder / "return-against-cost.png", *folder.glob("learning-curves_*.png")]:
             image = Image.open(figure).convert("RGB").quantize(COLOURS)
             image.save(ROOT / "docs/_static" / f"safety-gym-table-{figure.name}", optimize=True)
