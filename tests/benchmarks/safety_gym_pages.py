@@ -13,7 +13,6 @@ from typing import Any
 
 import pandas as pd
 
-from recrl.analysis.statistics.intervals import wilson_interval
 from tests.benchmarks.differences import paired_differences
 from tests.benchmarks.page_tables import replace_table
 from tests.benchmarks.velocity_table import Cell, number
@@ -165,18 +164,20 @@ def step_control(final: pd.DataFrame, phase: pd.DataFrame, multipliers: pd.DataF
 
 
 def claims(rows: pd.DataFrame) -> Iterator[str]:
-    """Yield the table of the paper's claims: in how many pairs of seeds, over the tasks, each holds."""
-    yield "| agent | claim | the paper's gain | final policies | deployment phase |"
+    """Yield the table of the paper's claims: in how many seeds each holds, on the three tasks in order."""
+    yield f"| agent | claim | the paper's gain | final policies on {', '.join(TASKS)} | deployment phase |"
     yield "|---" * 5 + "|"
-    text = rows["claim"].str.replace(r" on Car\w+", "", regex=True)
-    for (claim, agent), of_claim in rows.groupby([text, "agent"], sort=False):
-        counts = of_claim[["held", "seeds", "deployment_held", "deployment_seeds"]].sum()
-        held, seeds, deployed, deployed_seeds = map(int, counts)
-        interval = wilson_interval(held, seeds)
-        share = f"{held} of {seeds} ({interval.low:.0%} to {interval.high:.0%})"
-        in_phase = f"{deployed} of {deployed_seeds}" if deployed_seeds else ""
-        gain = of_claim["paper"].fillna("").iloc[0]
-        yield f"| `{agent}` | {str(claim).removeprefix(f'{agent} ')} | {gain} | {share} | {in_phase} |"
+    parts = rows["claim"].str.extract(r"(?P<text>.*) on (?P<task>Car\w+)(?P<scope>.*)")
+    for (text, scope, agent), of_claim in rows.join(parts).groupby(["text", "scope", "agent"], sort=False):
+        by_task = of_claim.set_index("task").reindex(TASKS)
+        counts = [
+            ", ".join(f"{held:.0f} of {seeds:.0f}" for held, seeds in by_task[columns].to_numpy())
+            for columns in (["held", "seeds"], ["deployment_held", "deployment_seeds"])
+        ]
+        in_phase = counts[1] if by_task["deployment_seeds"].any() else ""
+        gain = by_task["paper"].fillna("").iloc[0]
+        claim = f"{text}{scope}".removeprefix(f"{agent} ")
+        yield f"| `{agent}` | {claim} | {gain} | {counts[0]} | {in_phase} |"
 
 
 def tables() -> Iterator[tuple[Path, str, list[str]]]:
