@@ -54,6 +54,23 @@ def test_a_window_grows_until_it_is_enough() -> None:
     assert last_two_windows(history[1:], 1, is_enough=lambda it: it.episodes >= 3) is None
 
 
+def test_a_window_that_grows_ends_with_an_update_that_has_episodes() -> None:
+    empty = of_costs()
+    history = [of_costs(1.0), of_costs(2.0), empty, empty, of_costs(3.0), empty, of_costs(4.0), empty]
+    windows = last_two_windows(history, 2, is_enough=lambda window: window.episodes >= 2)
+    assert windows == (tuple(history[:4]), tuple(history[4:]))
+    assert WindowStatistics.pooled(windows[1]).env_steps == 400
+    assert last_two_windows(history[1:], 2, is_enough=lambda window: window.episodes >= 2) is None
+    asked: list[tuple[int, int]] = []
+
+    def never(window: WindowStatistics) -> bool:
+        asked.append((window.env_steps, window.episodes))
+        return False
+
+    assert last_two_windows(history, 1, is_enough=never) is None
+    assert asked == [(100, 0), (200, 1), (400, 2), (700, 3), (800, 4)]
+
+
 def test_windows_of_episodes_are_rounded_up_to_whole_updates() -> None:
     def windows(*history: WindowStatistics) -> object:
         return last_two_windows(history, 1, is_enough=lambda window: window.episodes >= 3)
