@@ -86,7 +86,7 @@ def write_rows_and_tests(archives: Mapping[str, Path]) -> None:
     ]
     (RESULTS / "power.txt").write_text(transcript(powers, ROOT))
     earlier = f"results/safety-gym/{PILOT[0]} results/safety-gym/table.csv"
-    confirm = f"-m tests.benchmarks.button_confirm results/safety-gym/button-confirm.csv --earlier {earlier}"
+    confirm = f"-m tests.benchmarks.confirmations results/safety-gym/button-confirm.csv --earlier {earlier}"
     (RESULTS / "button-confirm.txt").write_text(transcript([confirm], ROOT))
 
 
