@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pandas as pd
 from PIL import Image
+from scipy.stats import binomtest
 
 import recrl
 from recrl.orchestrator.cli.main import main as recrl_sweep
@@ -39,6 +40,7 @@ from tests.benchmarks.safety_gym_pages import (
     rows_of,
 )
 
+LIMIT = 25.0
 COLOURS = 128  # of a figure in the documentation
 TABLE_PARTS = ("table", "table-cpo")  # one archive would be too large for the repository
 PERIOD = 250_000  # steps, of a curve
@@ -121,6 +123,29 @@ def curve(updates: pd.DataFrame) -> pd.DataFrame:
     return means.round(2).reset_index()
 
 
+def limit_counts(rows: pd.DataFrame, policy: str) -> Iterator[str]:
+    """Yield how many policies exceed the limit by more than one standard error, and exact McNemar tests."""
+    chosen = of_policy(rows, policy)
+    exceeds = chosen.assign(exceeds=chosen["cost"] > LIMIT + chosen["cost_se"])
+    for agent, of_agent in exceeds.groupby("agent", sort=False):
+        yield f"{policy}, {agent}: {of_agent['exceeds'].sum()} of {len(of_agent)} exceed the limit"
+        counts = of_agent.groupby("method", sort=False)["exceeds"].agg(["sum", "size"])
+        yield "  " + ", ".join(f"{method} {it['sum']} of {it['size']}" for method, it in counts.iterrows())
+        wide = of_agent.pivot(index=["task", "seed"], columns="method", values="exceeds")
+        for method in wide.columns.drop("none"):
+            yield f"  {method} and none: {mcnemar(wide[[method, 'none']].dropna().astype(bool))}"
+    agents = exceeds.pivot(index=["task", "method", "seed"], columns="agent", values="exceeds").dropna()
+    yield f"{policy}, cpo and ppo-lag: {mcnemar(agents[['cpo', 'ppo-lag']].astype(bool))}"
+
+
+def mcnemar(pairs: pd.DataFrame) -> str:
+    """Return the pairs in which one of two exceeds the limit, and the exact p value."""
+    first, second = (pairs[name] for name in pairs)
+    only, other = int((first & ~second).sum()), int((~first & second).sum())
+    p = float(binomtest(only, only + other).pvalue) if only + other else 1.0
+    return f"of {len(pairs)} pairs {only} exceed with the first only, {other} with the second, p = {p:.2g}"
+
+
 def multipliers(updates: pd.DataFrame) -> pd.DataFrame:
     """Return those of the first and the last update of the deployment phase, a row a trial of ppo-lag."""
     deployed = updates[(updates["phase"] == "deployment") & (updates["agent"] == "ppo-lag")]
@@ -147,6 +172,12 @@ def main() -> None:
     for name, rows, methods, baselines in questions:
         lines = control_differences(of_question(rows, methods), baselines)
         (RESULTS / f"{name}.txt").write_text("\n".join([*lines, ""]))
+    counts: list[str] = []
+    for names in ((FRESH,), (*PILOT, FRESH)):
+        counts.append(f"{', '.join(names)}:")
+        for policy in POLICIES:
+            counts += limit_counts(rows_of(*names), policy)
+    (RESULTS / "table-limit.txt").write_text("\n".join([*counts, ""]))
     curve(of_question(updates, STEPS_UNDER_LIMIT)).to_csv(
         RESULTS / "steps-under-limit-curve.csv", index=False
     )
