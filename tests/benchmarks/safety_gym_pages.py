@@ -36,6 +36,9 @@ NOISE = ("none", "dynamic", "dynamic-without-noise")
 CURRICULA = (*STEPS_UNDER_LIMIT, "cosine", "exponential", *NOISE[1:], "step")
 PERIODS = ("phase", "first", "last")
 POLICIES = ("stochastic", "deterministic")
+FIRST_COLUMNS = ("agent", "task", "curriculum")
+
+Key = tuple[str, str, str]  # agent, task, curriculum
 
 
 def rows_of(*names: str) -> pd.DataFrame:
@@ -57,10 +60,26 @@ def of_question(rows: pd.DataFrame, methods: Sequence[str]) -> pd.DataFrame:
     return rows[chosen & rows["method"].isin(methods)]
 
 
-def groups(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield the rows of each agent, task and curriculum, after the first cells of their line."""
+def groups(rows: pd.DataFrame) -> Iterator[tuple[Key, pd.DataFrame]]:
+    """Yield the rows of each agent, task and curriculum."""
     for (agent, task, method), group in rows.groupby(["agent", "task", "method"], sort=False):
-        yield f"| `{agent}` | {task} | `{method}` |", group
+        yield (str(agent), str(task), str(method)), group
+
+
+def line(*cells: str) -> str:
+    """Return a line of a table."""
+    return f"| {' | '.join(cells)} |"
+
+
+def header(*columns: str) -> tuple[str, str]:
+    """Return the first two lines of a table."""
+    return line(*columns), "|---" * len(columns) + "|"
+
+
+def first_cells(key: Key) -> tuple[str, str, str]:
+    """Return the cells of an agent, a task and a curriculum."""
+    agent, task, method = key
+    return f"`{agent}`", task, f"`{method}`"
 
 
 def costs_of(cell: Cell) -> str:
@@ -88,16 +107,14 @@ def of_policy(rows: pd.DataFrame, policy: str) -> pd.DataFrame:
 def policies(rows: pd.DataFrame) -> Iterator[str]:
     """Yield the table of final policies: stochastic ones a column a seed, then the means of either kind."""
     seeds = sorted(rows["seed"].unique())
-    columns = [*(f"seed {it}" for it in seeds), "mean", "deterministic, mean"]
-    yield f"| agent | task | curriculum | {' | '.join(columns)} |"
-    yield "|---" * (3 + len(columns)) + "|"
-    for begin, group in groups(rows):
+    yield from header(*FIRST_COLUMNS, *(f"seed {it}" for it in seeds), "mean", "deterministic, mean")
+    for key, group in groups(rows):
         stochastic, deterministic = (of_policy(group, it) for it in POLICIES)
         of_seed = (
             stochastic.set_index("seed")[["return", "cost"]].map("{:.1f}".format).agg(" / ".join, axis=1)
         )
         each = [str(text) for text in of_seed.reindex(seeds, fill_value="")]
-        yield f"{begin} {' | '.join([*each, interval_of(stochastic), interval_of(deterministic)])} |"
+        yield line(*first_cells(key), *each, interval_of(stochastic), interval_of(deterministic))
 
 
 def shown(row: pd.Series[Any]) -> str:
@@ -106,7 +123,7 @@ def shown(row: pd.Series[Any]) -> str:
     return f"{mean} ({low} to {high}), p = {row['p_holm']:.2g}"
 
 
-def differences_of(rows: pd.DataFrame) -> dict[tuple[str, str, str], str]:
+def differences_of(rows: pd.DataFrame) -> dict[Key, str]:
     """Return the differences in return from ``none`` of each agent, task and curriculum."""
     table = paired_differences(rows, "none", "return")
     return {(row["agent"], row["task"], row["method"]): shown(row) for _, row in table.iterrows()}
@@ -114,70 +131,66 @@ def differences_of(rows: pd.DataFrame) -> dict[tuple[str, str, str], str]:
 
 def answers(rows: pd.DataFrame) -> Iterator[str]:
     """Yield the table of answers: stochastic policies, and differences from none."""
-    yield "| agent | task | curriculum | seeds | return / cost | return above `none` |"
-    yield "|---" * 6 + "|"
+    yield from header(*FIRST_COLUMNS, "seeds", "return / cost", "return above `none`")
     stochastic = of_policy(rows, "stochastic")
     texts = differences_of(stochastic)
-    for begin, group in groups(stochastic):
-        key = group[["agent", "task", "method"]].iloc[0]
-        yield f"{begin} {len(group)} | {mean_of(group)} | {texts.get(tuple(key), '')} |"
+    for key, group in groups(stochastic):
+        yield line(*first_cells(key), str(len(group)), mean_of(group), texts.get(key, ""))
 
 
 def other_differences(fresh: pd.DataFrame, seen: pd.DataFrame) -> Iterator[str]:
     """Yield the table of the differences from ``none`` that the table of answers does not have."""
-    names = "fresh seeds | deterministic, fresh seeds | deterministic, with the pilot"
-    yield f"| agent | task | curriculum | {names} |"
-    yield "|---" * 6 + "|"
+    names = ("fresh seeds", "deterministic, fresh seeds", "deterministic, with the pilot")
+    yield from header(*FIRST_COLUMNS, *names)
     both = pd.concat([seen, fresh])
     columns = [
         differences_of(of_policy(fresh, "stochastic")),
         differences_of(of_policy(fresh, "deterministic")),
         differences_of(of_policy(both, "deterministic")),
     ]
-    for begin, group in groups(fresh):
-        key = tuple(group[["agent", "task", "method"]].iloc[0])
+    for key, _ in groups(fresh):
         if key in columns[0]:
-            yield f"{begin} {' | '.join(column[key] for column in columns)} |"
+            yield line(*first_cells(key), *(column[key] for column in columns))
 
 
 def deployment_phase(rows: pd.DataFrame) -> Iterator[str]:
     """Yield the table of the deployment phase, means over the seeds."""
-    yield "| agent | task | curriculum | whole phase | first 100,000 steps | last 100,000 steps |"
-    yield "|---" * 6 + "|"
-    for begin, group in groups(rows):
+    yield from header(*FIRST_COLUMNS, "whole phase", "first 100,000 steps", "last 100,000 steps")
+    for key, group in groups(rows):
         means = group.groupby("policy")[["return", "cost"]].mean()
         cells = means.apply(lambda it: f"{it['return']:.1f} / {it['cost']:.1f}", axis=1)
-        yield f"{begin} {' | '.join(cells[period] for period in PERIODS)} |"
+        yield line(*first_cells(key), *(str(cells[period]) for period in PERIODS))
 
 
 def step_control(final: pd.DataFrame, phase: pd.DataFrame, multipliers: pd.DataFrame) -> Iterator[str]:
     """Yield the table of ``step`` and its controls: deployment phase, final policies, multipliers."""
-    yield "| task | curriculum | deployment phase | final policies | multiplier |"
-    yield "|---" * 5 + "|"
+    yield from header("task", "curriculum", "deployment phase", "final policies", "multiplier")
     tables = of_policy(final, "stochastic"), of_policy(phase, "phase"), multipliers
     for task in final.loc[final["method"] == "step", "task"].unique():
         for method in ("none", "linear", "step"):
             ended, learnt, ends = (of_cell(rows, task, method) for rows in tables)
             means = f"{learnt['return'].mean():.1f} / {learnt['cost'].mean():.1f}"
             moved = f"{ends['first'].mean():.2f}, {ends['last'].mean():.2f}"
-            yield f"| {task} | `{method}` | {means} | {mean_of(ended)} | {moved} |"
+            yield line(task, f"`{method}`", means, mean_of(ended), moved)
 
 
 def claims(rows: pd.DataFrame) -> Iterator[str]:
     """Yield the table of the paper's claims: in how many seeds each holds, on the three tasks in order."""
-    yield f"| agent | claim | the paper's gain | final policies on {', '.join(TASKS)} | deployment phase |"
-    yield "|---" * 5 + "|"
-    parts = rows["claim"].str.extract(r"(?P<text>.*) on (?P<task>Car\w+)(?P<scope>.*)")
-    for (text, scope, agent), of_claim in rows.join(parts).groupby(["text", "scope", "agent"], sort=False):
-        by_task = of_claim.set_index("task").reindex(TASKS)
-        counts = [
-            ", ".join(f"{held:.0f} of {seeds:.0f}" for held, seeds in by_task[columns].to_numpy())
-            for columns in (["held", "seeds"], ["deployment_held", "deployment_seeds"])
-        ]
-        in_phase = counts[1] if by_task["deployment_seeds"].any() else ""
+    final = f"final policies on {', '.join(TASKS)}"
+    yield from header("agent", "claim", "the paper's gain", final, "deployment phase")
+    parts = rows["claim"].str.extract(r"(?P<text>.*) on (?P<task>Car\w+)")
+    for (text, agent), of_claim in rows.join(parts).groupby(["text", "agent"], sort=False):
+        by_task = of_claim.set_index("task").loc[list(TASKS)]
         gain = by_task["paper"].fillna("").iloc[0]
-        claim = f"{text}{scope}".removeprefix(f"{agent} ")
-        yield f"| `{agent}` | {claim} | {gain} | {counts[0]} | {in_phase} |"
+        in_phase = seeds_in_which(by_task, "deployment_") if by_task["deployment_seeds"].any() else ""
+        claim = str(text).removeprefix(f"{agent} ")
+        yield line(f"`{agent}`", claim, gain, seeds_in_which(by_task, ""), in_phase)
+
+
+def seeds_in_which(claim: pd.DataFrame, measure: str) -> str:
+    """Return in how many seeds a claim holds, for each row, by the final policies or ``deployment_``."""
+    counts = claim[[f"{measure}held", f"{measure}seeds"]].to_numpy()
+    return ", ".join(f"{held} of {seeds}" for held, seeds in counts)
 
 
 def tables() -> Iterator[tuple[Path, str, list[str]]]:
