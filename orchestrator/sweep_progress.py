@@ -75,11 +75,11 @@ class SweepProgress:
 
     @property
     def steps_left(self) -> float:
-        """Remaining environment steps of all trials that have not failed."""
+        """Remaining environment steps of all trials but the failed and those left as damaged."""
         return sum(
             (1.0 - trial.fraction) * trial.spec.total_steps
             for trial in self.trials
-            if trial.status is not DisplayStatus.FAILED
+            if trial.status is not DisplayStatus.FAILED and not trial.record.is_left_alone
         )
 
     @property

@@ -180,10 +180,15 @@ def write_outcomes(sweep: Sweep, folder: Path) -> list[Path]:
         folder: where the file goes.
 
     Returns:
-        The file; nothing is written before a trial is complete.
+        The file; nothing is written before a trial is complete. A file that has these rows already keeps its
+        time, because the report counts as older than outcomes that were written after it.
     """
-    rows = metrics.outcomes(sweep)
-    return [table_formats.write_csv(rows, folder / OUTCOMES_FILE)] if len(rows) else []
+    rows, path = metrics.outcomes(sweep), folder / OUTCOMES_FILE
+    if not len(rows):
+        return []
+    if path.exists() and path.read_bytes() == table_formats.csv_bytes(rows):
+        return [path]
+    return [table_formats.write_csv(rows, path)]
 
 
 def _claims(counted_claims: pd.DataFrame) -> ShownTable:

@@ -214,9 +214,14 @@ def latex(table: pd.DataFrame) -> str:
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
 
 
+def csv_bytes(frame: pd.DataFrame) -> bytes:
+    """Return a data frame as CSV; floats as the shortest exact text."""
+    return frame.to_csv(index=False, lineterminator="\n").encode()
+
+
 def write_csv(frame: pd.DataFrame, path: Path) -> Path:
-    """Write a data frame as CSV; floats as the shortest exact text."""
-    return _written(frame.to_csv(index=False, lineterminator="\n").encode(), path)
+    """Write a data frame as CSV, as ``csv_bytes`` has it."""
+    return _written(csv_bytes(frame), path)
 
 
 def write_text(text: str, path: Path) -> Path:

@@ -28,7 +28,7 @@ def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
     try:
         grid = read_grid(request.grid, build=True)
     except UntrustedGridError as error:
-        say(console, f"{error}; everything else is right")
+        say(console, f"{error}; nothing else is wrong so far, but what depends on that code is not checked")
         return ExitCode.OK
     sizes = (len(grid.tasks), len(grid.agents), len(grid.methods), len(grid.seeds))
     product = " x ".join(str(size) for size in sizes)

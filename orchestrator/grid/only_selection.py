@@ -59,7 +59,7 @@ def select(specs: Sequence[TrialSpec], wanted: Mapping[str, Sequence[str]]) -> t
             commas between them, unless a label is that text.
 
     Raises:
-        RecrlError: no trial of the grid has a given key or value.
+        RecrlError: no trial of the grid has a given key or value, or none has all of them together.
     """
     from recrl.environments.plugins import nearest  # noqa: PLC0415
 
@@ -73,9 +73,13 @@ def select(specs: Sequence[TrialSpec], wanted: Mapping[str, Sequence[str]]) -> t
             if value not in known:
                 hint = nearest(value, known)
                 raise RecrlError(f"--only: no trial has {key} {value!r}{hint} (known: {', '.join(known)})")
-    return tuple(
+    chosen = tuple(
         spec for spec in specs if all(_label(spec, key) in values for key, values in accepted.items())
     )
+    if accepted and not chosen:
+        together = " and ".join(f"{key} {' or '.join(values)}" for key, values in accepted.items())
+        raise RecrlError(f"--only: no trial has {together} together")
+    return chosen
 
 
 def _label(spec: TrialSpec, key: str) -> str:

@@ -73,6 +73,8 @@ def sync(
 ) -> SyncReport:
     """Bring MLflow up to date with the sweep's files, once; do nothing if there is nothing new.
 
+    While a launch on this machine runs the sweep, waiting trials are shown as SCHEDULED, as it shows them.
+
     Args:
         store: the sweep.
         uri: of ``client.tracking_uri``.
@@ -82,7 +84,7 @@ def sync(
     Returns:
         The report of the pass; nothing is raised if MLflow is unreachable.
     """
-    return Tracker(store, uri, write_export).bring_up_to_date(live=False, rebuild=rebuild)
+    return Tracker(store, uri, write_export).bring_up_to_date(live=store.is_locked(), rebuild=rebuild)
 
 
 def last_report(store: SweepStore, uri: str) -> SyncReport | None:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from recrl.agents.agent import FinalPolicy
     from recrl.analysis.data.sweep_data import Sweep
     from recrl.environments.cmdp import CMDPSpec
+    from recrl.orchestrator.files.sweep_store import SweepStore
     from recrl.orchestrator.files.trial_store import TrialStore
     from recrl.orchestrator.spec import TrialSpec
 
@@ -58,7 +59,6 @@ def load_sweep(
         >>> final.groupby(by, observed=True)["cost_0"].mean()           # doctest: +SKIP
     """
     from recrl.analysis.data import export, from_mlflow, sweep_data  # noqa: PLC0415
-    from recrl.orchestrator.find_sweep import find_sweep  # noqa: PLC0415
     from recrl.orchestrator.tracking.client import checked_uri  # noqa: PLC0415
 
     with following(trust):
@@ -68,7 +68,7 @@ def load_sweep(
             raise RecrlError(f"name: only an MLflow address takes one; give root and source, got {name!r}")
         if str(source).endswith(export.SUFFIX):
             return export.load(Path(source))
-        return sweep_data.load(find_sweep(Path(root), str(source)))
+        return sweep_data.load(_up_to_date(Path(root), str(source)))
 
 
 def load_policy(
@@ -141,9 +141,7 @@ def _folder_of(sweep: Sweep, trial_id: str | None) -> Path:
 
 def _folder_below(source: str | Path, trial_id: str) -> Path:
     """The folder of a trial of the sweep with this name or folder."""
-    from recrl.orchestrator.find_sweep import find_sweep  # noqa: PLC0415
-
-    store = find_sweep(Path(DEFAULT_ROOT), str(source))
+    store = _up_to_date(Path(DEFAULT_ROOT), str(source), checkpoints=True)
     trial = next((it for it in store.trials() if it.trial_id == trial_id), None)
     if trial is None:
         raise RecrlError(
@@ -151,6 +149,16 @@ def _folder_below(source: str | Path, trial_id: str) -> Path:
             "column trial_id"
         )
     return trial.folder
+
+
+def _up_to_date(root: Path, source: str, *, checkpoints: bool = False) -> SweepStore:
+    """The folder of a sweep; a copy of one in an object store is brought up to date, or a warning logged."""
+    from recrl.orchestrator.find_sweep import find_sweep  # noqa: PLC0415
+    from recrl.orchestrator.remote.remote_sweep import sweep_place  # noqa: PLC0415
+
+    place = sweep_place(find_sweep(root, source))
+    place.refresh(checkpoints=checkpoints)
+    return place.store
 
 
 def policy_of(trial: TrialStore, *, seed: int | None) -> Policy:

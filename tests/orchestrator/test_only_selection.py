@@ -46,6 +46,16 @@ def test_a_selection_of_what_is_not_there_is_refused() -> None:
     assert str(caught.value) == "--only: trials are chosen by task, agent, method, seed, got 'colour'"
 
 
+def test_a_selection_that_no_trial_matches_is_refused() -> None:
+    some = select(SPECS, {"method": ["linear"], "agent": ["cpo"]})
+    others = select(SPECS, {"method": ["none"]})
+    with pytest.raises(RecrlError) as caught:
+        select([*some, *others], parse_only(["method=linear", "agent=ppo-lag", "seed=0,1"]))
+    assert str(caught.value) == (
+        "--only: no trial has method linear and agent ppo-lag and seed 0 or 1 together"
+    )
+
+
 def test_a_label_with_a_comma_is_selected_whole() -> None:
     labelled = GRID.replace(b"linear]", b"{name: linear, label: 'linear, slow'}]")
     specs = parse_grid(labelled, source="grid.yaml").trials()

@@ -34,8 +34,10 @@ COMMAND = [
 ]
 
 
-def launch(folder: Path) -> subprocess.Popen[str]:
-    return subprocess.Popen(COMMAND, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+def launch(folder: Path, *options: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*COMMAND, *options], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
 
 
 def running_trial(store: SweepStore) -> int:
@@ -89,7 +91,9 @@ def test_a_dead_service_of_ray_ends_the_launch_with_a_sentence_and_leaves_no_pro
         time.sleep(0.1)
     assert comm(trial) == ""
     assert all(it.record().update < it.spec.num_updates for it in store.trials())  # it died in the middle
-    again = launch(tmp_path)
+    again = launch(
+        tmp_path, "--executor", "inline"
+    )  # which goes on with the files as Ray does, and starts sooner
     _, errors = again.communicate(timeout=300.0)
     assert again.returncode == 0, errors
     assert [trial.record().status for trial in store.trials()] == [TrialStatus.COMPLETE]

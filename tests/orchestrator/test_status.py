@@ -119,6 +119,17 @@ def test_the_time_left_counts_what_runs_and_what_waits_but_not_what_failed() -> 
     )
 
 
+def test_the_time_left_has_no_damaged_trial_that_is_left_alone() -> None:
+    damaged = TrialRecord(TrialStatus.DAMAGED, attempt=1, env_steps=250)
+    sweep = SweepProgress(
+        (
+            _trial(SPECS[0], replace(damaged, is_left_alone=True)),
+            _trial(SPECS[1], replace(damaged, env_steps=0)),
+        )
+    )
+    assert sweep.steps_left == 1000  # the second one is repaired by the next launch
+
+
 def test_nothing_running_has_no_time_left() -> None:
     sweep = SweepProgress(
         (_trial(SPECS[0], replace(RUNNING, heartbeat=0.0)), _trial(SPECS[1], TrialRecord()))

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -438,6 +439,18 @@ def test_a_sweep_is_shown_as_a_parent_and_a_run_a_trial(write: Callable[..., Swe
     artifacts = {file.path for file in connect(store).list_artifacts(run.info.run_id)}
     assert {"spec.json", "evaluation.csv", "checkpoint-00000040.recrl"} <= artifacts
     assert store.mlflow_artifacts.is_dir()
+
+
+def test_a_pass_beside_a_launch_does_not_say_that_its_waiting_trials_were_killed(
+    write: Callable[..., SweepStore],
+) -> None:
+    store = write(missing=(NONE,))
+    [begun] = store.specs()
+    store.write_specs([begun, replace(begun, seed=7)])
+    for ended in (True, False, True):
+        with nullcontext() if ended else store.lock():
+            assert sync(store, tracking_uri(store, None)).is_up_to_date
+        assert runs(store)["made-up"].info.status == ("KILLED" if ended else "RUNNING")
 
 
 def test_a_pass_over_what_is_known_sends_nothing(write: Callable[..., SweepStore]) -> None:
