@@ -28,6 +28,7 @@ FRESH = "table.csv"
 FRESH_PHASE = "table-deployment-phase.csv"
 MULTIPLIERS = "multipliers.csv"  # of ppo-lag, in the first and the last update of the deployment phase
 CLAIMS = "table-claims.csv"
+CONFIRMATIONS = ("button-confirm", "goal-confirm")
 CONTROLS = ("controls", "early-landing", "short-training")  # with rows of the deployment phase, as the table
 AGENTS = ("ppo-lag", "cpo")
 TASKS = ("CarGoal2", "CarButton2", "CarPush2")
@@ -208,6 +209,7 @@ def tables() -> Iterator[tuple[Path, str, list[str]]]:
         (DETAILS, "claims", claims(pd.read_csv(RESULTS / CLAIMS))),
         (DETAILS, "pilot", policies(seen)),
         (DETAILS, "deployment phase", deployment_phase(phase)),
+        *((DETAILS, name, policies(rows_of(f"{name}.csv"))) for name in CONFIRMATIONS),
         (DETAILS, "steps under the limit", policies(of_question(everything, STEPS_UNDER_LIMIT))),
         (DETAILS, "noise", policies(of_question(current, NOISE))),
     )

@@ -4,7 +4,7 @@
 
 From table.zip (``ppo-lag``) and table-cpo.zip come the rows of final policies and of the deployment phase,
 the differences from ``none``, the claims and the figures; from these rows and those of other experiments the
-power. The controls and the confirmation have their own archives. The tables are written into the pages.
+power. The controls and the confirmations have their own archives. The tables are written into the pages.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from tests.benchmarks import safety_gym_pages
 from tests.benchmarks.differences import paired_differences
 from tests.benchmarks.safety_gym_pages import (
     CLAIMS,
+    CONFIRMATIONS,
     CONTROLS,
     FRESH,
     MULTIPLIERS,
@@ -45,7 +46,7 @@ COLOURS = 128  # of a figure in the documentation
 TABLE_PARTS = ("table", "table-cpo")  # one archive would be too large for the repository
 PERIOD = 250_000  # steps, of a curve
 LABELS = ("ppo-lag min-std", "cpo")  # of each agent in the tables for the power
-COUNTED = ("agents.csv", *PILOT, "margin-control.csv", FRESH, "button-confirm.csv")  # for the power
+COUNTED = ("agents.csv", *PILOT, "margin-control.csv", FRESH)  # for the power, and the confirmations
 
 
 def transcript(commands: Sequence[str], folder: Path = RESULTS) -> str:
@@ -66,7 +67,7 @@ def archive_of(name: str) -> Path:
 def write_rows_and_tests(archives: Mapping[str, Path]) -> None:
     """Write the rows of the table, and the tests."""
     scripts = "../../tests/benchmarks"
-    finals = {**archives, "button-confirm": archive_of("button-confirm")}
+    finals = {**archives, **{name: archive_of(name) for name in CONFIRMATIONS}}
     rows = [f"{scripts}/final_policies.py {path} --to {it}.csv" for it, path in finals.items()]
     phases = [
         f"{scripts}/deployment_phase.py {path} --to {it}-deployment-phase.csv"
@@ -80,7 +81,8 @@ def write_rows_and_tests(archives: Mapping[str, Path]) -> None:
         for policy in POLICIES
     ]
     (RESULTS / "table-differences.txt").write_text(transcript(tests))
-    tables = " ".join(f"results/safety-gym/{name}" for name in COUNTED)
+    confirmations = {name: f"results/safety-gym/{name}.csv" for name in CONFIRMATIONS}
+    tables = " ".join([*(f"results/safety-gym/{name}" for name in COUNTED), *confirmations.values()])
     powers = [
         f"tests/benchmarks/power.py {tables} --agents {labels} --tests {tests} --difference 1"
         for labels in LABELS
@@ -88,8 +90,9 @@ def write_rows_and_tests(archives: Mapping[str, Path]) -> None:
     ]
     (RESULTS / "power.txt").write_text(transcript(powers, ROOT))
     earlier = f"results/safety-gym/{PILOT[0]} results/safety-gym/table.csv"
-    confirm = f"-m tests.benchmarks.confirmations results/safety-gym/button-confirm.csv --earlier {earlier}"
-    (RESULTS / "button-confirm.txt").write_text(transcript([confirm], ROOT))
+    for name, rows_path in confirmations.items():
+        judge = f"-m tests.benchmarks.confirmations {rows_path} --earlier {earlier}"
+        (RESULTS / f"{name}.txt").write_text(transcript([judge], ROOT))
 
 
 def draw(table: Path) -> None:

@@ -131,7 +131,7 @@ def test_the_table_of_fresh_seeds_on_rivergrid_is_counted() -> None:
     assert f"{counted} {pairs} `none`." in README
     of_1b = solved.loc["rivergrid-1b"]
     without_noise = f"{of_1b['without-noise'].sum()} of {len(of_1b)} against {of_1b['none'].sum()}"
-    assert f"On 1b a relaxed limit without noise solves fewer: {without_noise}." in README
+    assert f"On 1b `dynamic` without its noise solves fewer than `none`: {without_noise}." in README
 
 
 def test_definitions_are_still_used() -> None:
