@@ -91,9 +91,7 @@ def test_a_dead_service_of_ray_ends_the_launch_with_a_sentence_and_leaves_no_pro
         time.sleep(0.1)
     assert comm(trial) == ""
     assert all(it.record().update < it.spec.num_updates for it in store.trials())  # it died in the middle
-    again = launch(
-        tmp_path, "--executor", "inline"
-    )  # which goes on with the files as Ray does, and starts sooner
+    again = launch(tmp_path, "--executor", "inline")  # the files are what matters, and it starts sooner
     _, errors = again.communicate(timeout=300.0)
     assert again.returncode == 0, errors
     assert [trial.record().status for trial in store.trials()] == [TrialStatus.COMPLETE]
