@@ -207,9 +207,10 @@ def test_a_trial_that_failed_before_its_first_step_is_further_than_one_that_wait
 
 
 def test_figures_need_no_row_of_the_trials_with_most_costs(part: Part, tmp_path: Path) -> None:
-    unstarted = part("two", tasks=("b",), num_costs=2)
+    few = {"methods": ("none", "dynamic"), "agents": ("cpo",), "seeds": 1}
+    unstarted = part("two", tasks=("b",), num_costs=2, **few)
     waiting = [dataclasses.replace(it, status=TrialStatus.WAITING, env_steps=0) for it in unstarted.facts]
-    merged = merge([part("one"), without_rows(waiting)])
+    merged = merge([part("one", **few), without_rows(waiting)])
     assert merged.num_costs == 2
     assert merged.updates["limit_1"].isna().all()
     assert drawing.draw(merged, tmp_path / "figures")
