@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from recrl.orchestrator.counting import counted
 from recrl.orchestrator.files.trial_files import HARD_LANDING
@@ -12,6 +12,7 @@ from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.teachers.registry import is_known_control
 
 NAMED = 5  # trials in a sentence, at most
+WITHOUT_TRAIN_LIMITS = ("none", "unconstrained")  # curricula that do not use them
 
 
 def landed_hard(spec: TrialSpec, events: Iterable[str]) -> bool:
@@ -48,6 +49,33 @@ def no_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
     times = max(math.ceil(spec.steps_per_update / (spec.deploy_steps - rounding)) for spec in short)
     remedy = f"take {times} times the total_steps or a larger deploy_fraction"
     return _warning(what, [spec.title for spec in short], remedy)
+
+
+def unrelaxed_sentence(specs: Sequence[TrialSpec]) -> str:
+    """Return the warning about curricula whose d_t is d_d; empty for none."""
+    what = "train_limits equal deploy_limits, so that the curriculum relaxes no limit"
+    unrelaxed = [
+        spec.title
+        for spec in specs
+        if spec.train_limits == spec.deploy_limits and spec.method.name not in WITHOUT_TRAIN_LIMITS
+    ]
+    return _warning(what, unrelaxed, "give larger train_limits, or auto")
+
+
+def short_training_sentence(specs: Sequence[TrialSpec], horizons: Mapping[str, int | None]) -> str:
+    """Return the warning about tasks whose training may end before the first episode does; empty for none.
+
+    Args:
+        specs: the trials.
+        horizons: most steps of an episode of each task, by its label; None if unknown.
+    """
+    what = "training gives each environment fewer steps than an episode may have, so maybe no episode ends"
+    tasks = dict.fromkeys(
+        spec.task.label
+        for spec in specs
+        if spec.train_steps // spec.num_envs < (horizons[spec.task.label] or 0)
+    )
+    return _warning(what, list(tasks), "take more total_steps or fewer num_envs")
 
 
 def unknown_horizon_sentence(tasks: Sequence[str]) -> str:

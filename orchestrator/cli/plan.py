@@ -37,7 +37,7 @@ def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
         f"{request.grid}: {grid.name} is right: {counted(len(grid.trials()), 'trial')}, from "
         f"tasks x agents x methods x seeds = {product}",
     )
-    _warn_of_steps(grid, grid.trials(), console)
+    _print_warnings(grid, grid.trials(), console)
     return ExitCode.OK
 
 
@@ -103,11 +103,11 @@ def say_plan(
     """Print what a launch would do, and its estimated time and memory."""
     say(console, f"{grid.name}: {display.plan_sentence(plan)}")
     say(console, display.estimate_sentence(estimate(plan, concurrent=at_once, speeds=speeds), where))
-    _warn_of_steps(grid, plan.to_do, console)
+    _print_warnings(grid, plan.to_do, console)
 
 
-def _warn_of_steps(grid: GridSpec, specs: Sequence[TrialSpec], console: Console) -> None:
-    """Print the warnings about tasks of unknown horizon and about trials without a deployment phase."""
+def _print_warnings(grid: GridSpec, specs: Sequence[TrialSpec], console: Console) -> None:
+    """Print the grid's warnings about horizons, steps and limits."""
     for sentence in grid.warnings(specs):
         say(console, f"warning: {sentence}")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from recrl.agents.agent import EntropyRewarded
 from recrl.agents.registry import AGENTS, make_agent
-from recrl.environments.cmdp import CMDPSpec
+from recrl.environments.cmdp import CMDPSpec, CostLimits
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
 from recrl.environments.registry import TASKS, make_vector
 from recrl.orchestrator.errors import USERS_ERRORS, described, described_with_place
@@ -19,11 +20,13 @@ from recrl.orchestrator.grid.problem_list import TASK_MARK
 from recrl.orchestrator.located_yaml import Place
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.teachers.registry import TEACHERS, find_teacher, make_teacher
-from recrl.teachers.teacher import check_limits_fall, checked_answer
+from recrl.teachers.static import StaticTeacher
+from recrl.teachers.teacher import ProgressReport, check_limits_fall, checked_answer
 
 logger = logging.getLogger("recrl.sweep")
 
 PLAIN_AGENT = Choice("ppo-lag")
+CHECKED_UPDATES = 200  # at most, of a curriculum of the clock
 NO_CURRICULUM, NO_LIMITS = Choice("none"), Choice("unconstrained")
 
 
@@ -130,6 +133,10 @@ def _curriculums_mistake(spec: TrialSpec, cmdp: CMDPSpec, *, is_rehearsed: bool)
         _check_start(spec, cmdp)
     except USERS_ERRORS as error:
         return f"cannot be started on {TASK_MARK}: {described_with_place(error)}"
+    try:
+        _check_decay(spec, cmdp)
+    except USERS_ERRORS as error:
+        return f"fails later in training on {TASK_MARK}: {described_with_place(error)}"
     mistake = _mistake(replace(spec, agent=PLAIN_AGENT)) if is_rehearsed else ""
     return f"on {TASK_MARK} {mistake}" if mistake else ""
 
@@ -166,6 +173,32 @@ def _check_start(spec: TrialSpec, cmdp: CMDPSpec) -> None:
         cost_names=cmdp.cost_names,
         update=0,
     )
+
+
+def _check_decay(spec: TrialSpec, cmdp: CMDPSpec) -> None:
+    """Check the limits of a curriculum of the clock alone, from the first update of training to the last.
+
+    An infinite d_t, which is yet to be measured, is replaced by one above d_d.
+    """
+    pairs = zip(spec.train_limits, spec.deploy_limits, strict=True)
+    train_limits = CostLimits(tuple(train if math.isfinite(train) else 2.0 * d + 1.0 for train, d in pairs))
+    teacher = make_teacher(replace(spec.teacher, train_limits=train_limits))
+    if not isinstance(teacher, StaticTeacher):
+        return
+    step, state = teacher.start()
+    updates = -(-spec.train_steps // spec.steps_per_update)
+    for update in np.unique(np.linspace(1, updates, min(updates, CHECKED_UPDATES), dtype=int)).tolist():
+        before = step.limits
+        step, state = teacher.step(state, ProgressReport(update, update * spec.steps_per_update, ()))
+        check_limits_fall(
+            step,
+            before,
+            train_limits,
+            deploy_limits=spec.deploy_limits,
+            curriculum=spec.method.label,
+            cost_names=cmdp.cost_names,
+            update=update,
+        )
 
 
 def _is_own_task(task: Choice) -> bool:

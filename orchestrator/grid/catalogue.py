@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Annotated, Any, Literal
@@ -69,7 +69,7 @@ class Option:
 
     Attributes:
         name: its key; of an option in an option, ``outer.inner``.
-        type: allowed values, in words.
+        type: allowed values, in words, with bounds of numbers.
         default: as JSON, or ``required``.
         description: one sentence.
     """
@@ -175,7 +175,8 @@ def _options(model: type[BaseModel], defaults: BaseModel | None, prefix: str) ->
         )
         shown = (it.text for it in field.metadata if isinstance(it, ShownDefault))
         default = next(shown, REQUIRED if value is PydanticUndefined else _json(value))
-        yield Option(f"{prefix}{name}", type_text(field.annotation), default, field.description or "")
+        allowed = _bounded(type_text(field.annotation), field.metadata)
+        yield Option(f"{prefix}{name}", allowed, default, field.description or "")
         inner = model_in(field.annotation)
         if inner is not None:
             inner_defaults = value if isinstance(value, BaseModel) else None
@@ -202,6 +203,8 @@ _WORDS: Mapping[Any, str] = {
     list: "list",
     tuple: "list",
 }
+
+_SIGNS: Mapping[str, str] = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 # Types that a function reads: their annotation has only its result.
 _WRITTEN = (
@@ -230,3 +233,17 @@ def type_text(annotation: Any) -> str:
     if (origin is not None and issubclass(origin, Mapping)) or model_in(annotation):
         return "mapping"
     return _WORDS.get(annotation) or str(getattr(annotation, "__name__", annotation))
+
+
+def _bounded(type_: str, metadata: Iterable[Any]) -> str:
+    """Add the bounds of a number to the description of a type.
+
+    >>> from annotated_types import Ge, Lt
+    >>> _bounded("number or null", [Ge(0.0), Lt(1.0)]), _bounded("text", [])
+    ('number >= 0, < 1 or null', 'text')
+    """
+    bounds = ", ".join(
+        f"{sign} {getattr(it, key):g}" for it in metadata for key, sign in _SIGNS.items() if hasattr(it, key)
+    )
+    first, *others = type_.split(" or ")
+    return " or ".join([f"{first} {bounds}" if bounds else first, *others])

@@ -9,7 +9,12 @@ from itertools import product
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.grid.file_models import Exclusion, Resources, Run
 from recrl.orchestrator.spec import Choice, TrialSpec
-from recrl.orchestrator.trial_warnings import no_deployment_sentence, unknown_horizon_sentence
+from recrl.orchestrator.trial_warnings import (
+    no_deployment_sentence,
+    short_training_sentence,
+    unknown_horizon_sentence,
+    unrelaxed_sentence,
+)
 
 
 @dataclass(frozen=True)
@@ -64,13 +69,19 @@ class GridSpec:
         return tuple(spec for spec in specs if not any(rule.matches(spec) for rule in self.exclude))
 
     def warnings(self, specs: Sequence[TrialSpec]) -> list[str]:
-        """Return sentences on tasks of unknown horizon and on trials without an update in deployment.
+        """Return sentences on tasks of unknown horizon, too few steps, and curricula that relax nothing.
 
         Args:
             specs: the trials that are to run.
         """
-        endless = [cell.task.label for cell in self.tasks if cell.horizon is None]
-        return [*filter(None, (unknown_horizon_sentence(endless), no_deployment_sentence(specs)))]
+        horizons = {cell.task.label: cell.horizon for cell in self.tasks}
+        sentences = (
+            unknown_horizon_sentence([task for task, horizon in horizons.items() if horizon is None]),
+            short_training_sentence(specs, horizons),
+            no_deployment_sentence(specs),
+            unrelaxed_sentence(specs),
+        )
+        return [*filter(None, sentences)]
 
     def _trial(self, seed: int, cell: TaskCell, agent: Choice, method: Choice) -> TrialSpec:
         deploy_steps = round(self.run.total_steps * self.run.deploy_fraction)

@@ -60,7 +60,8 @@ def validate(grid: Grid, *, trust: bool = False) -> GridSpec:
         RecrlError: no mistake was found, but an import path was not followed; see ``trust``.
 
     Warns:
-        UserWarning: a task does not say how long an episode may be, or no update falls into deployment.
+        UserWarning: an episode of a task may be endless, or longer than the training; no update falls into
+            deployment; or a curriculum relaxes no limit.
 
     Example:
         >>> import recrl

@@ -866,6 +866,29 @@ def test_a_grid_too_short_for_a_deployment_phase_is_a_warning(
         ) in capsys.readouterr().out.splitlines()
 
 
+def test_a_training_shorter_than_an_episode_is_a_warning(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "grid.yaml").write_text(GRID.replace("total_steps: 160", "total_steps: 60"))
+    assert main(["validate", "grid.yaml"]) == ExitCode.OK
+    assert (
+        "warning: training gives each environment fewer steps than an episode may have, so maybe no episode "
+        "ends: two-state; take more total_steps or fewer num_envs"
+    ) in capsys.readouterr().out.splitlines()
+
+
+def test_a_curriculum_that_relaxes_no_limit_is_a_warning(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "grid.yaml").write_text(GRID.replace("deploy_limits: 2", "deploy_limits: 2, train_limits: 2"))
+    assert main(["validate", "grid.yaml"]) == ExitCode.OK
+    [warning] = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: ")]
+    assert warning == (
+        "warning: train_limits equal deploy_limits, so that the curriculum relaxes no limit: "
+        "two-state ppo-lag linear seed 0; give larger train_limits, or auto"
+    )
+
+
 def test_a_task_that_does_not_say_how_long_an_episode_may_be_is_a_warning(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

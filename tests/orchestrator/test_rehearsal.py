@@ -17,6 +17,7 @@ from recrl.agents.algorithms.ppo import make_ppo
 from recrl.agents.registry import AGENTS, AgentEntry
 from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.teachers.registry import TeacherKind
+from recrl.teachers.static import StaticTeacher
 
 
 class Room(gymnasium.Env):
@@ -196,8 +197,26 @@ class NoStep:
         return CurriculumStep(CostLimits((5.0,))), {"update": 0}
 
 
+def too_low_later(p, train_limit, deploy_limit):
+    return train_limit if p < 0.5 else 0.5
+
+
+def rising(p, train_limit, deploy_limit):
+    return deploy_limit + (train_limit - deploy_limit) * abs(1.0 - 2.0 * p)
+
+
+def straight(p, train_limit, deploy_limit):
+    return p * deploy_limit + (1.0 - p) * train_limit
+
+
+def decaying(decay):
+    make = lambda spec: StaticTeacher(spec, decay=decay)
+    return TeacherKind(decay.__name__, NoOptions, make, measures_start=True)
+
+
 KINDS = (Staircase, TooLow, NoStep, Long)
 STAIRCASE, TOO_LOW, NO_STEP, LONG = (TeacherKind(kind.__name__, NoOptions, kind) for kind in KINDS)
+TOO_LOW_LATER, RISING, STRAIGHT = map(decaying, (too_low_later, rising, straight))
 '''
 
 
@@ -208,11 +227,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def problems(
-    task: str = "two-state", agents: Sequence[str] = ("cpo",), methods: Sequence[str] = ("none",)
+    task: str = "two-state",
+    agents: Sequence[str] = ("cpo",),
+    methods: Sequence[str] = ("none",),
+    train_limits: str = "5",
 ) -> list[str]:
     data = f"""\
 name: own
-tasks: [{{name: "{task}", deploy_limits: 2, train_limits: 5}}]
+tasks: [{{name: "{task}", deploy_limits: 2, train_limits: {train_limits}}}]
 agents: {list(agents)}
 methods: {list(methods)}
 seeds: 1
@@ -306,3 +328,18 @@ def test_a_curriculum(curriculum: str, sentence: str) -> None:
     (problem,) = problems(methods=[f"own_rehearsed:{curriculum}"])
     assert problem.startswith(f"grid.yaml:4: methods.0: own_rehearsed:{curriculum} on two-state ")
     assert sentence in problem
+
+
+@pytest.mark.parametrize(
+    ("curriculum", "sentence"),
+    [
+        ("TOO_LOW_LATER", "the decay must be between d_d = 2 and d_t = 5, got 0.5 at progress 0.5"),
+        ("RISING", "curriculum own_rehearsed:RISING: the limit of wear rose from 2"),
+    ],
+)
+@pytest.mark.parametrize("train_limits", ["5", "auto"])
+def test_a_decay_is_checked_up_to_its_end(curriculum: str, sentence: str, train_limits: str) -> None:
+    (problem,) = problems(methods=[f"own_rehearsed:{curriculum}"], train_limits=train_limits)
+    assert f"own_rehearsed:{curriculum} fails later in training on two-state: ValueError: " in problem
+    assert sentence in problem
+    assert problems(methods=["own_rehearsed:STRAIGHT"], train_limits=train_limits) == []

@@ -326,7 +326,7 @@ def test_a_loaded_policy_repeats_the_trials_evaluation(folder: Path) -> None:
 
 
 def test_a_policy_is_evaluated_as_by_its_trial_and_the_command(folder: Path) -> None:
-    training = train(task={"name": "rivergrid-1a", "options": {"horizon": 30}}, folder="one")
+    training = train(task={"name": "rivergrid-1a", "options": {"horizon": 20}}, folder="one")
     told = training.evaluations.query("policy == 'stochastic'")
     rows = training.policy.evaluate(len(told), seed=None)
     shared = ["index", "length", "episode_return", "cost_0"]
@@ -340,15 +340,15 @@ def test_a_policy_is_evaluated_as_by_its_trial_and_the_command(folder: Path) -> 
         np.testing.assert_array_equal(
             rows[shared].to_numpy(), both[both["policy"] == kind][shared].to_numpy()
         )
-    assert rows["length"].max() <= 30
+    assert rows["length"].max() <= 20
     with pytest.raises(ValueError, match="episodes: must be at least 1, got 0"):
         training.policy.evaluate(0)
     with pytest.raises(ValueError, match="seed: must be at least 0 or None, got -1"):
         training.policy.evaluate(seed=-1)
     environment = training.policy.make_env()
     environment.reset(seed=0)
-    ends = [environment.step(0)[3] for _ in range(30)]
-    assert ends == [False] * 29 + [True]
+    ends = [environment.step(0)[3] for _ in range(20)]
+    assert ends == [False] * 19 + [True]
 
 
 def test_folders_that_hold_no_trial_are_refused(tmp_path: Path) -> None:
