@@ -96,8 +96,9 @@ def evaluate(
         if should_stop():
             raise StoppedError
         if steps >= most_steps:
+            short = next(i for i, share in enumerate(shares) if len(done[i]) < share)
             raise RuntimeError(
-                f"evaluation: no episode ended in {most_steps:,} steps of an environment; the task must "
+                f"evaluation: no episode ended in {most_steps:,} steps of environment {short}; the task must "
                 "return terminated or truncated at some time (gymnasium.wrappers.TimeLimit does)"
             )
         _, finished = collector.collect(EvaluatedPolicy(actor, policy), generator)

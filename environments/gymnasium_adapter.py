@@ -125,11 +125,9 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         costs = np.zeros((self.num_envs, self.cmdp.num_costs))
         # The environments get copies: one may scale its action in place, and the recorded one is replayed.
         for index, (action, own) in enumerate(zip(actions, actions.copy(), strict=True)):
-            observation, reward, ended, timed_out, step_info = self._step(index, own)
-            last_observations[index] = self._flat(observation)
-            rewards[index] = self._number(reward)
-            terminated[index], truncated[index] = ended, timed_out and not ended
-            costs[index] = self._reported_costs(step_info)
+            result = self._step(index, own)
+            last_observations[index], rewards[index], costs[index] = result[:3]
+            terminated[index], truncated[index] = result[3:]
             self._episode_actions[index].append(action)
         self._check(last_observations, rewards)
         rows = _rows(last_observations, rewards, costs, terminated, truncated)
@@ -230,19 +228,19 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         """Repeat an environment's episode; return its last observation."""
         observation = self._first_observation(index)
         for action in np.array(self._episode_actions[index]):  # copies, as in ``step``
-            returned, reward, ended, timed_out, info = self._step(index, action)
-            observation = self._flat(returned)
+            observation, reward, costs, terminated, truncated = self._step(index, action)
             row = _rows(
                 observation[np.newaxis],
-                np.array([self._number(reward)]),
-                self._reported_costs(info)[np.newaxis],
-                np.array([ended]),
-                np.array([timed_out and not ended]),
+                np.array([reward]),
+                costs[np.newaxis],
+                np.array([terminated]),
+                np.array([truncated]),
             )
             self._checksums[index] = zlib.crc32(row.tobytes(), self._checksums[index])
         return observation
 
-    def _step(self, index: int, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def _step(self, index: int, action: Any) -> tuple[npt.NDArray[np.float32], float, Floats, bool, bool]:
+        """Take a step in one environment; return observation [n], reward, costs [k], and the two flags."""
         returned = self._environments[index].step(action)
         if not isinstance(returned, tuple) or len(returned) != 5 or not isinstance(returned[4], dict):
             six = isinstance(returned, tuple) and len(returned) == 6
@@ -254,7 +252,14 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         for name, flag in zip(("terminated", "truncated"), returned[2:4], strict=True):
             if not _is_flag(flag):
                 raise ValueError(f"{self.cmdp.name}: {name} must be True or False, got {_brief(flag)}")
-        return returned
+        observation, reward, terminated, truncated, info = returned
+        return (
+            self._flat(observation),
+            self._number(reward),
+            self._reported_costs(info),
+            bool(terminated),
+            bool(truncated and not terminated),
+        )
 
     def _number(self, reward: Any) -> float:
         try:

@@ -251,8 +251,17 @@ def unmeasured(plan: Plan) -> tuple[TrialSpec, ...]:
 
 def trials_at_once(*, cpus_per_trial: float, max_concurrent: int | None, cores: int | None = None) -> int:
     """Return how many trials fit on a number of cores, by default this machine's; at least 1."""
-    fitting = max(1, int((cores or usable_cores()) / cpus_per_trial))
+    fitting = max(1, trials_within(cores or usable_cores(), cpus_per_trial))
     return min(fitting, max_concurrent or fitting)
+
+
+def trials_within(there: float, asked: float) -> int:
+    """Return for how many trials an amount of a resource is enough, without errors of rounding.
+
+    >>> trials_within(7.0, 0.07), trials_within(2.0, 0.75)
+    (100, 2)
+    """
+    return int(there / asked + 1e-9)
 
 
 def trials_on_gpus(gpus: float, gpus_per_trial: float) -> int:

@@ -90,7 +90,10 @@ def _root(data: bytes) -> yaml.Node:
         line = data[: error.start].count(b"\n") + 1
         raise _UnreadableError(line, "the file must be UTF-8 text, and this line is not") from error
     except yaml.reader.ReaderError as error:
-        raise _UnreadableError(1, "the file holds a character that YAML does not allow") from error
+        before = data.decode("utf-8-sig")[: error.position]
+        raise _UnreadableError(
+            before.count("\n") + 1, f"YAML does not allow the character U+{error.character:04X}"
+        ) from error
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark else 1

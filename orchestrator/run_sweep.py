@@ -13,7 +13,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import copy_context
 from dataclasses import dataclass, field
 from types import FrameType
@@ -190,9 +190,10 @@ def _stopping_on_request(store: SweepStore, stop: threading.Event) -> Iterator[N
 
     def watch(over: threading.Event) -> None:
         while not over.wait(REQUEST_SECONDS):
-            if store.stop_request_path.exists():
-                stop.set()
-                return
+            with suppress(OSError):  # the disk may come back
+                if store.stop_request_path.exists():
+                    stop.set()
+                    return
 
     store.stop_request_path.unlink(missing_ok=True)
     try:
@@ -247,7 +248,8 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
         if len(times) > 1:  # its duplicates must not reach the handlers of before
             time.sleep(max(0.0, times[-1] + ONE_SIGNAL_SECONDS - time.monotonic()))
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if handler is not None:  # None for a handler that was not installed from Python
+                signal.signal(number, handler)
         first.put(False)
         answering.join()
 

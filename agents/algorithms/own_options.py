@@ -115,29 +115,20 @@ class IPOConfig(AscentConfig):
     )
 
 
-ViolationIntegralGain = Annotated[
-    NonNegative,
-    Field(
-        description="K of the integral of the violations, per update. Costs fall by less than the "
-        "linear model predicts; the integral corrects that (ours; paper 0)."
-    ),
-]
-
-
 class CPOConfig(TrustRegionConfig):
     """Settings of ``cpo``, constrained policy optimisation."""
 
     paper: ClassVar[Mapping[str, Any]] = {**TrustRegionConfig.paper, "violation_integral_gain": 0.0}
 
-    violation_integral_gain: ViolationIntegralGain = 0.03
+    violation_integral_gain: NonNegative = Field(
+        default=0.03,
+        description="K of the integral of the violations, per update. Costs fall by less than the "
+        "linear model predicts; the integral corrects that (ours; paper 0).",
+    )
 
 
-class PCPOConfig(TrustRegionConfig):
+class PCPOConfig(CPOConfig):
     """Settings of ``pcpo``, projection-based constrained policy optimisation."""
-
-    paper: ClassVar[Mapping[str, Any]] = {**TrustRegionConfig.paper, "violation_integral_gain": 0.0}
-
-    violation_integral_gain: ViolationIntegralGain = 0.03
 
 
 class TRPOConfig(TrustRegionConfig):

@@ -22,16 +22,21 @@ from recrl.agents.building_blocks.scales import RunningScale, quotient
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.environments.cmdp import Floats
 
+# Of the reward's advantages in a rollout, relative to those of a cost. In a rollout with equal rewards the
+# advantages of costs would be scaled without bound, and Adam would remember it for thousands of steps.
+LEAST_SPREAD = 0.1
+
 
 @dataclass(frozen=True, eq=False)
 class RelativeAdvantages:
     """Advantages in common units.
 
     Attributes:
-        rewards: standardised advantages, [N].
+        rewards: standardised advantages, [N]; smaller in a rollout in which costs differ much more.
         costs: centred advantages of each cost times its ``factors``, [N, k].
-        factors: u_i / the spread of the reward's advantages in this rollout, [k]; 0 if the cost has not
-            occurred. Before any reward, 1 / the spread of the cost's: costs are avoided from the start.
+        factors: u_i / the spread of the reward's advantages in this rollout, or, if that is larger,
+            / ``LEAST_SPREAD`` of a cost's in the same unit, [k]; 0 if the cost has not occurred. Before any
+            reward, 1 / the spread of the cost's: costs are avoided from the start.
         exchange_rates: u, reward per unit of cost, [k]; 0 before any reward or cost i.
     """
 
@@ -54,10 +59,11 @@ class RelativeUnits:
     def of(self, advantages: Floats) -> RelativeAdvantages:
         """Include a rollout's raw advantages, [N, 1 + k], in the spreads, and scale them."""
         centred = advantages - advantages.mean(axis=0)
-        spread = reward_spread(centred)
         self._spreads.add((centred**2).mean(axis=0))
         of_reward, of_costs = self._spreads.values[:1], self._spreads.values[1:]
         exchange_rates = quotient(of_reward, of_costs)
+        in_reward = exchange_rates * centred[:, 1:].std(axis=0)
+        spread = max(reward_spread(centred), LEAST_SPREAD * float(in_reward.max(initial=0.0)))
         factors = exchange_rates / spread if of_reward > 0.0 else quotient(np.ones(1), of_costs)
         return RelativeAdvantages(centred[:, 0] / spread, centred[:, 1:] * factors, factors, exchange_rates)
 

@@ -107,7 +107,10 @@ def save(sweep: Sweep, path: Path) -> Path:
     members = {"sweep.json": text, **tables}
     size = sum(len(text.encode()) for text in members.values())
     if size > MAX_BYTES:
-        raise RecrlError(f"{path}: a compact file may unpack to {MAX_BYTES} bytes, this one has {size}")
+        raise RecrlError(
+            f"{path}: an export may unpack to {MAX_BYTES} bytes, this one has {size}; use the sweep's own "
+            "folder"
+        )
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w") as archive:
         for name, text in members.items():

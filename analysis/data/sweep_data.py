@@ -52,6 +52,7 @@ from recrl.analysis.data.optima import NO_OPTIMUM, UNKNOWN_OPTIMUM, optima_of
 from recrl.analysis.data.phase_totals import phase_totals
 from recrl.environments.cmdp import Phase
 from recrl.environments.finite.finite_cmdp import FiniteCMDP
+from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import EPISODE_COLUMNS, EVALUATION_COLUMNS, UPDATE_COLUMNS
@@ -81,7 +82,7 @@ PHASE_COST_COLUMNS = (("cost", ""), ("cost", "_std"), ("cost", "_total"), ("exce
 EVENT_COLUMNS = ("update", "end_step", "event")
 ROWS = ("phases", "updates", "evaluations", "events", "policies")  # the data frames that it receives
 
-# The agents' metrics in figures and tables; MLflow and the export file have no others.
+# The agents' metrics in figures and tables; the export file has no others.
 DRAWN_METRICS = re.compile(
     r"(multiplier|cost_advantage_max)_\d+|explained_variance_(reward|cost_\d+)|kl|case"
 )
@@ -147,7 +148,7 @@ class Sweep:
         statuses = ", ".join(
             f"{count} {name}" for name, count in self.trials["status"].value_counts().items()
         )
-        trials = f"{len(self.trials)} trials{f' ({statuses})' if statuses else ''}"
+        trials = f"{counted(len(self.trials), 'trial')}{f' ({statuses})' if statuses else ''}"
         return f"<Sweep {self.name}: {trials}; data frames trials, {', '.join(ROWS)}>"
 
     @property

@@ -23,7 +23,6 @@ from matplotlib.patches import Rectangle
 
 from recrl.analysis.data.exact_values import policy_table
 from recrl.analysis.data.labels import occurring
-from recrl.analysis.data.number_texts import number
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import styles
 from recrl.analysis.figures.styles import TEXT_WIDTH
@@ -39,6 +38,7 @@ from recrl.environments.rivergrid.grid_world import (
 )
 from recrl.environments.rivergrid.maps import GOAL, MUD, RIVER, STEPS, WALL, RiverMap
 from recrl.orchestrator.errors import USERS_ERRORS
+from recrl.orchestrator.number_texts import number
 
 TILE_COLOURS = {WALL: "#4a4a4a", RIVER: "#b9dcf2", MUD: "#d9c29a", GOAL: "#a8dba8"}
 DRY_COLOUR = "#f6f1e4"

@@ -36,7 +36,7 @@ from pathlib import Path
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import styles
 from recrl.analysis.report.figure_list import SKETCHED, Drawing, drawings
-from recrl.analysis.report.pages import write_reports
+from recrl.analysis.report.pages import shown_figures, write_reports
 from recrl.analysis.report.table_files import write_tables
 from recrl.analysis.statistics.curves import MEAN, CurveAverage
 from recrl.orchestrator.errors import described
@@ -71,17 +71,19 @@ def sketch(sweep: Sweep, folder: Path, *, averaging: CurveAverage = MEAN) -> lis
         folder: where the files go.
         averaging: of the learning curves.
     """
-    figures = drawings(sweep, averaging=averaging)
-    sketched = {stem: drawing for stem, drawing in figures.items() if drawing.kind in SKETCHED}
-    return _draw(sweep, folder, sketched, unfinished=True)
+    return _draw(sweep, folder, drawings(sweep, averaging=averaging), unfinished=True)
 
 
 def _draw(
     sweep: Sweep, folder: Path, figures: Mapping[str, Drawing], *, unfinished: bool = False
 ) -> list[Path]:
-    """Draw some figures, write all tables and the report; of an unfinished sweep only PNGs, with a note."""
+    """Draw figures, write all tables and the report; of an unfinished sweep few PNGs, with a note."""
+    later = {stem for stem, it in figures.items() if unfinished and it.kind not in SKETCHED}
+    earlier = shown_figures(folder)
     drawn, mistakes = [], _Mistakes()
     for stem, drawing in figures.items():
+        if stem in later:
+            continue
         with mistakes.kept(stem):
             if (figure := drawing.make()) is None:
                 styles.remove(folder, stem)  # of an earlier grid
@@ -90,6 +92,8 @@ def _draw(
                 drawn.append(styles.save_png(figure, folder / f"{stem}.png"))
             else:
                 drawn += styles.save(figure, folder, stem)
+    for stem in earlier - later - {path.stem for path in drawn}:  # of an earlier grid, or a mistake
+        styles.remove(folder, stem)
     notes = [*mistakes.notes, UNFINISHED] if unfinished else mistakes.notes
     noted = dataclasses.replace(sweep, notes=(*sweep.notes, *notes))
     written, tables = write_tables(noted, folder)

@@ -24,6 +24,7 @@ from recrl.analysis.report.table_files import BOOTSTRAP_SEED, COST_AND_BOUNDS, C
 from recrl.analysis.statistics.cumulative_cost import is_bounded
 from recrl.analysis.statistics.curves import MEAN, CurveAverage, interquartile
 from recrl.analysis.statistics.metrics import Measure
+from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import RecrlError
 
 CAPTIONS = {
@@ -80,8 +81,8 @@ def drawings(sweep: Sweep, *, averaging: CurveAverage = MEAN) -> dict[str, Drawi
     """
     if not len(sweep.updates):
         raise NothingToDrawError(
-            f"{sweep.name}: nothing to draw yet, because none of its {len(sweep.trials)} trials has "
-            f"committed a policy update"
+            f"{sweep.name}: nothing to draw yet, because no trial has committed a policy update "
+            f"({counted(len(sweep.trials), 'trial')})"
         )
     agents = ordered(list(sweep.updates["agent"]), list(sweep.trials["agent"].cat.categories))
     cells = sweep.updates[["task", "agent"]].drop_duplicates().astype(str).to_numpy().tolist()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -21,6 +22,7 @@ from recrl.analysis.report.verdict_answers import answers, no_verdict
 from recrl.analysis.report.verdict_table import FAILED, verdict_kinds, verdict_table
 from recrl.analysis.report.verdict_terms import explanation, task_sentences
 from recrl.analysis.statistics.intervals import ENOUGH_RUNS
+from recrl.orchestrator.counting import counted
 from recrl.orchestrator.files.outcomes_file import INFEASIBLE
 from recrl.orchestrator.spec import TrialStatus
 
@@ -46,6 +48,15 @@ def write_reports(
         table_formats.write_text(_html(sweep, drawn, figures, tables), folder / "report.html"),
         table_formats.write_text(_markdown(sweep, drawn, figures, tables), folder / "report.md"),
     ]
+
+
+def shown_figures(folder: Path) -> set[str]:
+    """Return the file stems of the figures that the report in a folder shows; empty without a report."""
+    try:
+        text = (folder / "report.md").read_text(encoding="utf-8")
+    except (FileNotFoundError, UnicodeDecodeError):
+        return set()
+    return set(re.findall(r"^!\[([\w.+-]+)\]\(\1\.png\)$", text, re.MULTILINE))
 
 
 def _html(sweep: Sweep, drawn: list[Path], figures: Mapping[str, Drawing], tables: Tables) -> str:
@@ -121,7 +132,7 @@ def _settings(sweep: Sweep) -> str:
 def _provenance(sweep: Sweep) -> list[str]:
     """Return every distinct provenance of the trials, with the number of trials."""
     origins = Counter(trial.provenance for trial in sweep.facts if trial.provenance)
-    return [f"{count} trials:\n{text}" for text, count in sorted(origins.items())]
+    return [f"{counted(count, 'trial')}:\n{text}" for text, count in sorted(origins.items())]
 
 
 def _markdown(sweep: Sweep, drawn: list[Path], figures: Mapping[str, Drawing], tables: Tables) -> str:
@@ -166,12 +177,12 @@ def missing(sweep: Sweep) -> list[str]:
     for status, what in (
         (TrialStatus.DAMAGED, "damaged"),
         (TrialStatus.FAILED, "failed"),
-        (TrialStatus.RUNNING, "still running"),
+        (TrialStatus.RUNNING, "running or interrupted"),
         (TrialStatus.WAITING, "waiting to be run"),
     ):
         chosen = sweep.trials[sweep.trials["status"] == status.value]
         if status is TrialStatus.WAITING and (blank := chosen["env_steps"] == 0).any():
-            sentences.append(f"{blank.sum()} trials: not begun yet")
+            sentences.append(f"{counted(int(blank.sum()), 'trial')}: not begun yet")
             chosen = chosen[~blank]
         for _, row in chosen.iterrows():
             done = row["env_steps"] / row["total_steps"]
@@ -193,7 +204,7 @@ def _count(sweep: Sweep) -> str:
     """Count trials by status: ``20 trials: 1 running, 19 complete.``."""
     counts = sweep.trials["status"].value_counts()
     states = [f"{counts[state.value]} {state.value}" for state in TrialStatus if counts.get(state.value)]
-    return f"{len(sweep.trials)} trials: {', '.join(states)}."
+    return f"{counted(len(sweep.trials), 'trial')}: {', '.join(states)}."
 
 
 def _full_sizes(drawn: list[Path]) -> dict[Path, str]:

@@ -11,7 +11,6 @@ import pandas as pd
 
 from recrl.analysis.data.cost_names import cost_names, cost_suffix
 from recrl.analysis.data.labels import GROUP
-from recrl.analysis.data.number_texts import DASH
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import curriculum_flags
 from recrl.analysis.report import table_formats
@@ -25,6 +24,7 @@ from recrl.analysis.statistics.metrics import Measure
 from recrl.analysis.statistics.verdict_counts import count_verdicts
 from recrl.analysis.statistics.verdicts import SOLVED_GAP
 from recrl.orchestrator.files.outcomes_file import OUTCOMES_FILE
+from recrl.orchestrator.number_texts import DASH
 
 COST_AND_BOUNDS = "Cumulative cost of training against its bounds"
 COST_AND_LIMITS = "Cumulative cost of training against the limits in force"

@@ -14,10 +14,10 @@ from pathlib import Path
 import pandas as pd
 
 from recrl.analysis.data.labels import GROUP
-from recrl.analysis.data.number_texts import DASH, number, with_error
 from recrl.analysis.statistics.intervals import share_text
 from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.files.atomic_files import write_atomically
+from recrl.orchestrator.number_texts import DASH, number, with_error
 from recrl.orchestrator.redaction import printable
 
 TOO_FEW = "†"

@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 
 from recrl.analysis.data.labels import GROUP
-from recrl.analysis.data.number_texts import DASH, number
 from recrl.analysis.statistics.claims import CLAIMS, Comparison
 from recrl.analysis.statistics.intervals import share_text
 from recrl.environments.cmdp import Phase
 from recrl.orchestrator.files.trial_reader import TrialReader
+from recrl.orchestrator.number_texts import DASH, number
 
 SUM_COLUMNS = {
     "cost": "cost_sum",

@@ -7,11 +7,11 @@ import math
 import pandas as pd
 
 from recrl.analysis.data.labels import BASELINE, joined
-from recrl.analysis.data.number_texts import DASH, number
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report.verdict_table import cost_title, unevaluated
 from recrl.analysis.statistics.verdicts import costs_of
 from recrl.orchestrator.files.outcomes_file import FEASIBLE, INFEASIBLE, SOLVED
+from recrl.orchestrator.number_texts import DASH, number
 from recrl.orchestrator.spec import TrialStatus
 
 ONE_SEED = "One seed (n = 1): no intervals, and another seed may give another verdict."

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pandas as pd
 
-from recrl.analysis.data.number_texts import DASH, number, with_error
 from recrl.analysis.report.table_formats import with_interval
 from recrl.analysis.statistics.verdicts import costs_of, is_cost
 from recrl.orchestrator.files.outcomes_file import FEASIBLE, INFEASIBLE, SOLVED
+from recrl.orchestrator.number_texts import DASH, number, with_error
 
 DEPLOYMENT = "deployment phase (learning goes on)"
 DIFFERENCE = "difference to none"

@@ -7,12 +7,12 @@ import pandas as pd
 
 from recrl.analysis.data.cost_names import cost_suffix
 from recrl.analysis.data.labels import BASELINE, joined
-from recrl.analysis.data.number_texts import number
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report.table_formats import not_corrected
 from recrl.analysis.report.verdict_table import DEPLOYMENT, DIFFERENCE, WARNINGS, verdict_table
 from recrl.analysis.statistics.verdicts import COST_TOLERANCE, SOLVED_GAP
 from recrl.environments.registry import TASKS
+from recrl.orchestrator.number_texts import number
 from recrl.teachers.registry import may_measure_start
 
 

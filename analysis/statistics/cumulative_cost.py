@@ -58,7 +58,6 @@ from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.statistics.metrics import with_finished_training
 from recrl.environments.cmdp import Floats, Phase
-from recrl.orchestrator.errors import RecrlError
 from recrl.teachers.bounds import (
     DECAYS,
     discounted_excess,
@@ -188,9 +187,12 @@ def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.
         GROUP, policies, episodes_per_policy, overshoot (assumed, per policy); used_train_limit (the largest
         of the runs); measured_over_deploy (of the worst run, over all episodes); largest_train_limit (NaN if
         d_t = d_d exceeds the budget, infinite if d_t does not matter).
+
+    Raises:
+        ValueError: the budget is negative.
     """
     if not budget >= 0.0:
-        raise RecrlError(f"--budget: must be at least 0, got {budget:g}")
+        raise ValueError(f"budget: must be at least 0, got {budget:g}")
     names = {tuple(group): str(name) for *group, name in sweep.trials[[*GROUP, "method_name"]].to_numpy()}
     lines = []
     for group, runs in rows.groupby(list(GROUP), observed=True, sort=False):

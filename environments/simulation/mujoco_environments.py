@@ -16,7 +16,6 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from pydantic import BaseModel
 
@@ -134,7 +133,6 @@ class MujocoVectorEnv(CMDPVectorEnv):
         self._camera = Camera(render_mode, description.make_renderer)
         self.metadata = {
             **CMDPVectorEnv.metadata,
-            "autoreset_mode": AutoresetMode.SAME_STEP,
             **description.rendering,
         }
         self.single_observation_space, self.single_action_space = description.spaces

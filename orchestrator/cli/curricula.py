@@ -45,7 +45,10 @@ def run_bound(request: BoundRequest, console: Console) -> ExitCode:
         "–: not known for this agent or task.",
     )
     if request.budget is not None:
-        allowed = cumulative_cost.admissible_limits(rows, sweep, budget=request.budget)
+        try:
+            allowed = cumulative_cost.admissible_limits(rows, sweep, budget=request.budget)
+        except ValueError as error:
+            raise RecrlError(f"--{error}") from error
         say(
             console,
             f"\nThe largest training limit d_t within {request.budget:g} of net cost above the deployment "

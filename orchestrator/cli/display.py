@@ -41,11 +41,14 @@ _STYLES = {
 }
 
 
+FROM_THE_BEGINNING = (PlannedAction.REPAIR, PlannedAction.DAMAGED, PlannedAction.RERUN)
+
+
 def plan_table(plan: Plan) -> Table:
     """Return a table of all trials and their planned actions."""
     table = _table("trial", "seed", "action", "done", "id")
     for trial in plan.trials:
-        done = 0 if trial.action in (PlannedAction.REPAIR, PlannedAction.DAMAGED) else trial.record.env_steps
+        done = 0 if trial.action in FROM_THE_BEGINNING else trial.record.env_steps
         fraction = 1.0 if trial.action is PlannedAction.COMPLETE else done / trial.spec.total_steps
         table.add_row(
             f"{trial.spec.task.label} {trial.spec.agent.label} {trial.spec.method.label}",

@@ -152,8 +152,10 @@ def _say_results(sweep: Sweep, console: Console) -> None:
         say(console, "")
         show(table, console)
         say(console, caption)
-        for sentence in curriculum_warnings(sweep):
-            say(console, f"warning: {sentence}")
+    sentences = curriculum_warnings(sweep)
+    for sentence in sentences:
+        say(console, f"warning: {sentence}")
+    if len(table) or sentences:
         say(console, "")
 
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import pandas as pd
 
 from recrl.analysis.data.cost_names import cost_names, cost_suffix
-from recrl.analysis.data.number_texts import number, with_error
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import curriculum_flags
 from recrl.analysis.report.table_formats import names_of
@@ -16,6 +15,7 @@ from recrl.analysis.report.verdict_terms import all_exact, measured_how, toleran
 from recrl.analysis.statistics.metrics import outcomes
 from recrl.analysis.statistics.verdict_counts import count_verdicts
 from recrl.analysis.statistics.verdicts import SOLVED_GAP
+from recrl.orchestrator.number_texts import number, with_error
 
 
 def result_table(sweep: Sweep) -> tuple[pd.DataFrame, str]:

@@ -9,6 +9,7 @@ from rich.console import Console
 from recrl.orchestrator.cli.output import say
 from recrl.orchestrator.cli.requests import SyncRequest, UIRequest
 from recrl.orchestrator.cli.sweeps import open_store
+from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -22,12 +23,12 @@ from recrl.orchestrator.tracking.ui import open_ui
 def run_ui(request: UIRequest, console: Console) -> ExitCode:
     """Open MLflow's pages about a sweep, on this machine only."""
     store = open_store(request)
+    for number in (signal.SIGINT, signal.SIGTERM):  # open_ui, too, ends the server before it raises
+        signal.signal(number, signal.default_int_handler)
     ui = open_ui(store, tracking_uri(store, request.tracking_uri), port=request.port)
     say(console, f"Open {ui.url}")
     if ui.process is not None:
         say(console, "Ctrl-C ends it.")
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.default_int_handler)
         try:
             ui.process.wait()
         except KeyboardInterrupt:
@@ -43,12 +44,13 @@ def run_sync(request: SyncRequest, console: Console) -> ExitCode:
     if outcomes.lack_a_complete_trial() or (request.trust and outcomes.has_sampled()):
         _measure(store, console)
     report = sync(store, uri, rebuild=request.rebuild, write_export=write_in_own_process)
+    trials = counted(report.trials, "trial")
     if not report.is_up_to_date:
         raise TrackingError(
-            f"MLflow is behind by {report.behind} of {report.trials} trials: {report.problem}; the files "
-            "have all that was committed: sync again later, or see 'recrl-sweep check' for damaged files"
+            f"MLflow is behind by {report.behind} of {trials}: {report.problem}; the files have all that was "
+            "committed: sync again later, or see 'recrl-sweep check' for damaged files"
         )
-    say(console, f"MLflow shows all {report.trials} trials of {store.name}; {report.points} points were new")
+    say(console, f"MLflow is up to date with {store.name}: {trials}, {counted(report.points, 'new point')}")
     if report.remark:
         say(console, without_export(report.remark))
     return ExitCode.OK

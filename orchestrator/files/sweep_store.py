@@ -310,7 +310,8 @@ class SweepStore:
                 file.seek(0)
                 holder = file.read().strip() or "another process"
                 raise SweepBusyError(
-                    f"{self.folder}: this sweep is already being run by {holder}; wait for it or stop it"
+                    f"{self.folder}: this sweep is already being run by {holder}; wait for it, "
+                    "or end it with recrl-sweep stop"
                 )
             file.truncate(0)
             file.write(f"process {os.getpid()} on {socket.gethostname()}\n")

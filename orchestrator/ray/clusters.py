@@ -28,14 +28,14 @@ from recrl.orchestrator.ray.private_api import (
 from recrl.orchestrator.ray.process_state import environment, own_signal_handlers
 from recrl.orchestrator.ray.services import (
     RAY_FOLDER,
-    TOKEN,
-    TOKEN_VARIABLE,
     end_processes,
 )
 
 CONNECT_SECONDS = 5.0
 CONNECT_TRIES = 3
 OBJECT_STORE_BYTES = 80 * 2**20  # Ray requires 75 MiB at least; recrl stores nothing of that size
+TOKEN_VARIABLE = "RAY_AUTH_TOKEN_PATH"
+TOKEN = "token"  # in the cluster's folder
 PREFIX = "recrl-ray-"  # only the next cluster removes such a folder: it ends the processes first
 LONGEST_SOCKET_FOLDER = 40  # characters: a socket's path may have 107, of which Ray takes up to 67
 
@@ -73,7 +73,7 @@ logger = logging.getLogger("recrl.sweep")
 
 
 @contextmanager
-def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
+def local_cluster(num_cpus: int | None = None) -> Iterator[Path]:
     """Start a Ray cluster on this machine until the end of the context, closed to other users.
 
     Its services listen at the loopback address and require a token, so that neither other machines nor other
@@ -82,6 +82,9 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
 
     Args:
         num_cpus: number of cores, at least 1; all of the machine's if None.
+
+    Yields:
+        The cluster's folder.
 
     Raises:
         ClusterError: Ray does not start.
@@ -108,7 +111,7 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[None]:
                     _temp_dir=str(folder / RAY_FOLDER),
                 ),
             ):
-                yield
+                yield folder
 
 
 @contextmanager

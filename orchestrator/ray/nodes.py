@@ -15,7 +15,7 @@ from ray.exceptions import RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from recrl.orchestrator.errors import ClusterError, first_line
-from recrl.orchestrator.launch_plan import trials_on_gpus
+from recrl.orchestrator.launch_plan import trials_on_gpus, trials_within
 from recrl.orchestrator.provenance.versions import DISTRIBUTION, LIBRARIES
 
 DISTRIBUTIONS = (DISTRIBUTION, "ray", *LIBRARIES)
@@ -38,7 +38,7 @@ def trials_that_fit(wanted: Mapping[str, float]) -> int:
 
 def _fitting(name: str, there: float, asked: float) -> int:
     """Return how many trials a node's amount of one resource is enough for."""
-    return trials_on_gpus(there, asked) if name == "GPU" else int(there / asked + 1e-9)
+    return trials_on_gpus(there, asked) if name == "GPU" else trials_within(there, asked)
 
 
 def check_nodes(probe: str, uri: str = "") -> None:

@@ -105,7 +105,7 @@ class RayExecutor:
         """Return the wall seconds without a heartbeat after which a trial of a place counts as hanging."""
         return max(self.resources.silence_seconds, place.shortest_silence_seconds)
 
-    def _cluster(self) -> AbstractContextManager[None]:
+    def _cluster(self) -> AbstractContextManager[Path | None]:
         if ray.is_initialized():
             return nullcontext()
         if self.address:
@@ -170,7 +170,8 @@ class RayExecutor:
             there = {name: resources.get(name, 0.0) for name in asked}
             raise ClusterError(
                 f"a trial asks for {_amounts(asked)}, this cluster has {_amounts(there)}; "
-                "ask for less or add machines"
+                "lower cpus_per_trial, gpus_per_trial or custom_per_trial in the grid's resources, or add "
+                "machines"
             )
         return min(slots, most or slots)
 

@@ -31,9 +31,7 @@ OWN_PATIENCE_SECONDS = 5.0  # services of recrl's own cluster are not restarted
 OTHERS_PATIENCE_SECONDS = 40.0  # below the minute after which Ray ends a process without a head service
 LEAVE_SECONDS = 10.0  # time for a launch to finish afterwards
 
-TOKEN_VARIABLE = "RAY_AUTH_TOKEN_PATH"
-TOKEN = "token"  # in the folder of a local cluster
-RAY_FOLDER = "ray"  # in the same folder
+RAY_FOLDER = "ray"  # in the folder of a local cluster
 SERVICES = ("ray::", "raylet", "gcs_server")  # names of Ray's processes, or their beginnings
 
 logger = logging.getLogger("recrl.sweep")
@@ -85,6 +83,7 @@ class LostServices:
     def __init__(self) -> None:
         self.problem = ""
         self._services: tuple[Service, ...] = ()
+        self._folder: Path | None = None
 
     def check(self) -> None:
         """Raise an error if a service has died.
@@ -100,7 +99,7 @@ class LostServices:
         return not all(service.is_there() for service in self._services)
 
     @contextmanager
-    def watched(self, cluster: AbstractContextManager[None]) -> Iterator[None]:
+    def watched(self, cluster: AbstractContextManager[Path | None]) -> Iterator[None]:
         """Watch a cluster's services until the end of the context, and make sure that it can be left.
 
         Without its services Ray may block a thread of this process without end. So a launch that has not left
@@ -108,9 +107,9 @@ class LostServices:
         valid.
 
         Args:
-            cluster: the connection to it.
+            cluster: the connection to it; gives the folder of a local cluster.
         """
-        with background_thread(self._look, name="Ray's services"), cluster:
+        with background_thread(self._look, name="Ray's services"), cluster as self._folder:
             self._services = _services()
             try:
                 yield
@@ -127,8 +126,8 @@ class LostServices:
                     self.problem = service.message
         if self.problem and not over.wait(LEAVE_SECONDS):
             logger.error("%s", self.problem)
-            if token := os.environ.get(TOKEN_VARIABLE):
-                end_processes(Path(token).parent)
+            if self._folder is not None:
+                end_processes(self._folder)
             os._exit(ExitCode.CANNOT_RUN)
 
 

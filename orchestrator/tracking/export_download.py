@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from recrl.orchestrator.errors import RecrlError, TrackingError
+from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.tracking.client import EXPERIMENTS, MLFLOW_SETTINGS, connect, one_line, sqlite_path
 from recrl.orchestrator.tracking.export_file import FILE_NAME, FOLDER, UPLOADED_TAG
@@ -47,9 +48,9 @@ def downloaded_export(uri: str, name: str | None) -> Iterator[Download]:
     Raises:
         TrackingError: MLflow cannot be reached, shows no such sweep, or has no export file of it.
     """
-    with TemporaryDirectory() as folder:
+    with scratch_folder(tempfile.gettempdir()) as folder:
         try:
-            download = _download(uri, name, Path(folder))
+            download = _download(uri, name, folder)
         except RecrlError:
             raise
         except Exception as error:  # MLflow passes on the errors of its database or its server

@@ -9,6 +9,7 @@ complete trial is not in it.
 from __future__ import annotations
 
 import csv
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from recrl.orchestrator.files.outcomes_file import (
 )
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
+from recrl.orchestrator.number_texts import number, with_error
 from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.tracking.positions import file_mark
 
@@ -132,9 +134,9 @@ def trial_note(outcome: FinalOutcome, start_limits: Sequence[float]) -> str:
     """
     how = "computed exactly" if outcome.exact else "means over sampled episodes"
     verdict = f"{outcome.verdict}{_by(outcome.excesses)}"
-    costs = _listed(outcome.costs, digits=3)
+    costs = ", ".join(with_error(cost, math.nan, digits=3) for cost in outcome.costs)
     return (
-        f"**{verdict}**: return {_text(outcome.episode_return)}, cost {costs}, "
+        f"**{verdict}**: return {number(outcome.episode_return)}, cost {costs}, "
         f"limit d_d {_listed(outcome.limits)}, training limit d_t {_listed(start_limits)}.\n\n"
         f"These are the metrics `final/...` of the final policy (stochastic, without learning), {how}, as in "
         "the report. `evaluation/...` are means over sampled episodes of the same policy. "
@@ -149,7 +151,7 @@ def _by(excesses: Sequence[float]) -> str:
     """
     names = [f", cost {i}" for i in range(len(excesses))] if len(excesses) > 1 else [""]
     by = zip(names, excesses, strict=True)
-    return "".join(f"{name} by {_text(excess)}" for name, excess in by if excess > 0.0)
+    return "".join(f"{name} by {number(excess)}" for name, excess in by if excess > 0.0)
 
 
 def _outcome(row: Mapping[str, str]) -> FinalOutcome:
@@ -168,12 +170,5 @@ def _outcome(row: Mapping[str, str]) -> FinalOutcome:
     )
 
 
-def _listed(values: Sequence[float], *, digits: int = 2) -> str:
-    return ", ".join(f"{value:.{digits}f}" for value in values)
-
-
-def _text(value: float) -> str:
-    size = abs(value)
-    if 1e-9 <= size < 0.01:  # 0.000 would read as none
-        return f"{value:.2g}"
-    return f"{value:z.{3 if 0.01 <= size < 0.1 else 2}f}"  # z: no -0.00
+def _listed(values: Sequence[float]) -> str:
+    return ", ".join(map(number, values))

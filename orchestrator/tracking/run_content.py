@@ -38,6 +38,7 @@ from itertools import islice
 import pandas as pd
 
 from recrl.environments.cmdp import Phase
+from recrl.orchestrator.counting import counted
 from recrl.orchestrator.files.trial_files import UPDATE_COLUMNS
 from recrl.orchestrator.spec import TrialSpec
 
@@ -204,7 +205,7 @@ def note(name: str, counts: Mapping[str, int], *, charts: str, report: str, repo
     """
     total = sum(counts.values())
     states = ", ".join(f"{count} {state}" for state, count in counts.items() if count) or "none yet"
-    lines = [f"**{name}**: {total} trials ({states}). [Charts, seeds averaged]({charts})."]
+    lines = [f"**{name}**: {counted(total, 'trial')} ({states}). [Charts, seeds averaged]({charts})."]
     if report_text:
         lines.append(f"[Report]({report}); its figures are artifacts of this run.")
     else:

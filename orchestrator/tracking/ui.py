@@ -74,7 +74,7 @@ def open_ui(store: SweepStore, uri: str, *, port: int = 5000) -> UI:
         TrackingError: the port is taken, or the server does not start.
     """
     if not is_server(uri) and _answers(port):
-        raise TrackingError(f"port {port} of 127.0.0.1 is taken by another program; choose another port")
+        raise TrackingError(f"port {port} of 127.0.0.1 is taken by another program; choose another --port")
     if last_report(store, uri) is None:
         sync(store, uri)
     url = ui_url(store, uri, port=port)
@@ -86,15 +86,27 @@ def open_ui(store: SweepStore, uri: str, *, port: int = 5000) -> UI:
     with open(os.open(log_path, flags, 0o600), "wb") as log:
         environment = {**os.environ, "MLFLOW_BACKEND_STORE_URI": uri}
         server = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
+    ui = UI(url, server)
+    try:
+        if not _starts(server, port):
+            raise TrackingError(
+                f"MLflow's server did not start; its output is in {log_path}, the command was "
+                f"{shlex.join(command)}"
+            )
+    except BaseException:  # also a signal
+        ui.close()
+        raise
+    return ui
+
+
+def _starts(server: subprocess.Popen[bytes], port: int) -> bool:
+    """Wait until a server accepts connections; return False if it ends or takes too long."""
     end = time.monotonic() + START_SECONDS
     while time.monotonic() < end and server.poll() is None:
         if _answers(port):
-            return UI(url, server)
+            return True
         time.sleep(0.2)
-    UI(url, server).close()
-    raise TrackingError(
-        f"MLflow's server did not start; its output is in {log_path}, the command was {shlex.join(command)}"
-    )
+    return False
 
 
 def _answers(port: int) -> bool:

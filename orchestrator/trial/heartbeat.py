@@ -23,7 +23,7 @@ logger = logging.getLogger("recrl.trial")
 
 
 class Heartbeat:
-    """Run a heartbeat for the thread that enters this context, while that thread computes.
+    """A sign of life for a thread while it computes; see ``beating``.
 
     Args:
         beat: writes a sign of life; may raise LostLeaseError.

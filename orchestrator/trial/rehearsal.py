@@ -15,6 +15,7 @@ from recrl.agents.registry import make_agent
 from recrl.agents.spaces import environment_actions
 from recrl.orchestrator.errors import USERS_ERRORS, described
 from recrl.orchestrator.files.checkpoint_format import encode
+from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.agent_answers import checked_noise
@@ -58,10 +59,10 @@ def rehearse(spec: TrialSpec) -> None:
         deploy_steps=num_envs * steps,
         evaluation_episodes=0,
     )
-    with one_thread(), tempfile.TemporaryDirectory(prefix="recrl-") as scratch:
-        whole = _run(small, spec.teacher, Path(scratch) / "whole", restart=False)
+    with one_thread(), scratch_folder(tempfile.gettempdir()) as scratch:
+        whole = _run(small, spec.teacher, scratch / "whole", restart=False)
         try:
-            resumed = _run(small, spec.teacher, Path(scratch) / "resumed", restart=True)
+            resumed = _run(small, spec.teacher, scratch / "resumed", restart=True)
         except USERS_ERRORS as error:
             raise RestartError(f"{described(error)}; {REMEDY}") from error
         _compare(whole, resumed)

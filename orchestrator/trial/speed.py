@@ -5,9 +5,9 @@ from __future__ import annotations
 import tempfile
 import time
 from contextlib import closing
-from pathlib import Path
 
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
+from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.one_thread import one_thread
@@ -31,8 +31,8 @@ def measured_speed(spec: TrialSpec, *, seconds: float = MEASURED_SECONDS) -> flo
         RecrlError: the task or the agent raised an error.
     """
     try:
-        with one_thread(), tempfile.TemporaryDirectory(prefix="recrl-") as scratch:
-            store = TrialStore(Path(scratch) / spec.folder_name)
+        with one_thread(), scratch_folder(tempfile.gettempdir()) as scratch:
+            store = TrialStore(scratch / spec.folder_name)
             with closing(Trial(spec, store.begin(spec), make_teacher(spec.teacher))) as trial:
                 return _speed(trial, seconds)
     except RecrlError:

@@ -22,6 +22,7 @@ from recrl._results import Policy, following, load_sweep, policy_of
 from recrl.environments.plugins import modules_here
 from recrl.orchestrator.errors import NO_PATH, NO_ROOM, GridError, RecrlError, StorageError, described
 from recrl.orchestrator.exit_codes import ExitCode
+from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 from recrl.orchestrator.grid.checked_grid import GridSpec
@@ -298,7 +299,7 @@ class Training:
 
 
 def _scratch(stack: ExitStack) -> Path:
-    return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="recrl-"))) / "trial"
+    return stack.enter_context(scratch_folder(tempfile.gettempdir())) / "trial"
 
 
 @contextmanager

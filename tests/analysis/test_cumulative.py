@@ -16,7 +16,6 @@ from recrl.analysis.statistics import cumulative_cost
 from recrl.analysis.statistics.metrics import training_totals
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.cli.main import main
-from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
@@ -163,7 +162,7 @@ def test_a_policy_without_an_episode_costs_what_its_neighbour_does(finished: Swe
 
 
 def test_a_negative_budget_is_refused(finished: Sweep) -> None:
-    with pytest.raises(RecrlError, match=r"^--budget: must be at least 0, got -1$"):
+    with pytest.raises(ValueError, match=r"^budget: must be at least 0, got -1$"):
         cumulative_cost.admissible_limits(pd.DataFrame(), finished, budget=-1.0)
 
 

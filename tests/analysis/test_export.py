@@ -173,7 +173,7 @@ def test_a_file_that_would_fill_the_memory_is_refused(
     monkeypatch.setattr(export, "MAX_BYTES", 10_000)
     with pytest.raises(RecrlError, match=r"file \(it unpacks to \d+ bytes, at most 10000 are taken\)"):
         export.load(path)
-    with pytest.raises(RecrlError, match=r"a compact file may unpack to 10000 bytes, this one has \d+"):
+    with pytest.raises(RecrlError, match=r"an export may unpack to 10000 bytes, this one has \d+"):
         export.save(finished, path)
 
 

@@ -11,10 +11,12 @@ import pytest
 
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.sweep_data import Sweep
+from recrl.analysis.figures import learning_curves
 from recrl.analysis.report import drawing, figure_list, table_files
 from recrl.analysis.report.figure_list import NothingToDrawError
 from recrl.analysis.report.verdict_answers import no_verdict
 from recrl.orchestrator.files.sweep_store import SweepStore
+from tests.conftest import MadeUpSweep
 from tests.faults.committing import commit_file
 
 
@@ -65,7 +67,7 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
     assert (
         "- river-a my cpo linear seed 1: failed, 50% of its steps done: ValueError: the river froze" in text
     )
-    assert "- river-a my cpo linear seed 0: still running, 50% of its steps done" in text
+    assert "- river-a my cpo linear seed 0: running or interrupted, 50% of its steps done" in text
     assert (
         "- 2 seeds: bootstrap intervals are too short below 10 seeds (marked †); Student's hold for normal "
         "data; Wilson's cover about 95% on average, but as low as 83% when the true fraction is near 0 or 1"
@@ -181,12 +183,43 @@ def test_no_table_or_figure_of_an_earlier_grid_stays_beside_a_new_report(
     assert (tmp_path / "mine.csv").read_text() == "old"
 
 
+@pytest.mark.usefixtures("unrendered")
+def test_figures_that_an_earlier_report_shows_are_drawn_again_or_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def sweep(*agents: str) -> Sweep:
+        made_up = MadeUpSweep(seeds=1, tasks=("a",), agents=agents, methods=("none",), updates=10)
+        return sweep_data.load(made_up.write(tmp_path, "-".join(agents)))
+
+    def figures() -> set[str]:
+        return {path.stem for path in tmp_path.glob("*.png")} & {path.stem for path in tmp_path.glob("*.pdf")}
+
+    two, one = sweep("cpo", "ppo-lag"), sweep("cpo")
+    drawing.draw(two, tmp_path)
+    before = figures()
+    for suffix in ("png", "pdf"):
+        (tmp_path / f"learning-curves_mine.{suffix}").write_text("the user's")
+    drawing.sketch(one, tmp_path)
+    gone = {stem for stem in before if "ppo-lag" in stem}
+    assert gone
+    assert figures() == (before | {"learning-curves_mine"}) - gone
+
+    def mistaken(*_: object, **__: object) -> None:
+        raise KeyError("river")
+
+    drawing.draw(one, tmp_path)
+    monkeypatch.setattr(learning_curves, "curricula", mistaken)
+    with pytest.raises(KeyError, match="river"):
+        drawing.draw(one, tmp_path)
+    assert figures() == (before | {"learning-curves_mine"}) - gone - {"curricula"}
+
+
 def test_nothing_to_draw_is_one_clear_sentence(tmp_path: Path) -> None:
     store = SweepStore(tmp_path, "empty")
     with pytest.raises(NothingToDrawError) as caught:
         drawing.draw(sweep_data.load(store), tmp_path / "figures")
     assert str(caught.value) == (
-        "empty: nothing to draw yet, because none of its 0 trials has committed a policy update"
+        "empty: nothing to draw yet, because no trial has committed a policy update (0 trials)"
     )
     assert not (tmp_path / "figures").exists()
 

@@ -8,13 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from recrl.analysis.data.number_texts import number, with_error
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report import table_files, table_formats
 from recrl.analysis.statistics import metrics
 from recrl.analysis.statistics.comparisons import comparisons
 from recrl.analysis.statistics.cumulative_cost import cumulative_costs
 from recrl.analysis.statistics.metrics import Measure
+from recrl.orchestrator.number_texts import number, with_error
 
 
 def test_a_row_a_group_with_absolute_numbers(finished: Sweep) -> None:

@@ -426,7 +426,7 @@ def test_each_mistake_has_its_sentence(old: str, new: str, problem: str | None) 
         (b"name: [1\nseeds: 2", "grid.yaml:2: not valid YAML: expected ',' or ']', but got ':'"),
         (b"a: 1\n\tb: 2", "grid.yaml:2: not valid YAML: found character '\\t' that cannot start any token"),
         (b"a: 1\nb: \xff\n", "grid.yaml:2: the file must be UTF-8 text, and this line is not"),
-        (b"a: \x00", "grid.yaml:1: the file holds a character that YAML does not allow"),
+        (b"a: 1\nb: \x00", "grid.yaml:2: YAML does not allow the character U+0000"),
         (b'a: "\\UFFFFFFFF"', "grid.yaml:1: not valid YAML: a character is out of range"),
         (b"a: 1\n---\nb: 2\n", "grid.yaml:2: not valid YAML: but found another document"),
         (b"a: *b\n", "grid.yaml:1: not valid YAML: found undefined alias 'b'"),

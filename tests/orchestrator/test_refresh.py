@@ -16,7 +16,7 @@ def test_a_report_appears_while_the_sweep_runs_and_says_so(made_up_sweep: Callab
     with refreshing(store, first_seconds=0.0, interval_seconds=60.0):
         while not page.exists() and time.monotonic() < end:
             time.sleep(0.1)
-    assert "still running, 50% of its steps done" in page.read_text()
+    assert "running or interrupted, 50% of its steps done" in page.read_text()
     assert '<meta http-equiv="refresh" content="120">' in page.with_suffix(".html").read_text()
 
 

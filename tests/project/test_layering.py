@@ -20,8 +20,10 @@ ALLOWED = {
     "agents": ("recrl.environments",),
     "analysis": (
         "recrl.environments",
+        "recrl.orchestrator.counting",
         "recrl.orchestrator.errors",
         "recrl.orchestrator.files",
+        "recrl.orchestrator.number_texts",
         "recrl.orchestrator.provenance.code_changes",
         "recrl.orchestrator.redaction",
         "recrl.orchestrator.spec",
@@ -70,6 +72,7 @@ LAYERS = (
         "errors",
         "exit_codes",
         "located_yaml",
+        "number_texts",
         "process_scope",
         "redaction",
         "spec",
