@@ -248,8 +248,8 @@ def stopping_on_signals(stop: threading.Event, say: Callable[[], None]) -> Itera
         if len(times) > 1:  # its duplicates must not reach the handlers of before
             time.sleep(max(0.0, times[-1] + ONE_SIGNAL_SECONDS - time.monotonic()))
         for number, handler in before.items():
-            if handler is not None:  # None for a handler that was not installed from Python
-                signal.signal(number, handler)
+            # None stands for a handler that was not installed from Python, and cannot be installed from it
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
         first.put(False)
         answering.join()
 

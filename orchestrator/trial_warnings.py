@@ -12,7 +12,7 @@ from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.teachers.registry import is_known_control
 
 NAMED = 5  # trials in a sentence, at most
-WITHOUT_TRAIN_LIMITS = ("none", "unconstrained")  # curricula that do not use them
+IGNORING_TRAIN_LIMITS = ("none", "unconstrained")  # curricula
 
 
 def landed_hard(spec: TrialSpec, events: Iterable[str]) -> bool:
@@ -53,11 +53,11 @@ def no_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
 
 def unrelaxed_sentence(specs: Sequence[TrialSpec]) -> str:
     """Return the warning about curricula whose d_t is d_d; empty for none."""
-    what = "train_limits equal deploy_limits, so that the curriculum relaxes no limit"
+    what = "train_limits equal deploy_limits, so that the limits are d_d from the start"
     unrelaxed = [
         spec.title
         for spec in specs
-        if spec.train_limits == spec.deploy_limits and spec.method.name not in WITHOUT_TRAIN_LIMITS
+        if spec.train_limits == spec.deploy_limits and spec.method.name not in IGNORING_TRAIN_LIMITS
     ]
     return _warning(what, unrelaxed, "give larger train_limits, or auto")
 
@@ -73,9 +73,14 @@ def short_training_sentence(specs: Sequence[TrialSpec], horizons: Mapping[str, i
     tasks = dict.fromkeys(
         spec.task.label
         for spec in specs
-        if spec.train_steps // spec.num_envs < (horizons[spec.task.label] or 0)
+        if _training_updates(spec) * spec.rollout_steps < (horizons[spec.task.label] or 0)
     )
     return _warning(what, list(tasks), "take more total_steps or fewer num_envs")
+
+
+def _training_updates(spec: TrialSpec) -> int:
+    """Return the policy updates of the training phase; the last one may end after it."""
+    return -(-spec.train_steps // spec.steps_per_update)
 
 
 def unknown_horizon_sentence(tasks: Sequence[str]) -> str:

@@ -80,7 +80,7 @@ class Multipliers:
         """Update the multipliers, unless the violations are unknown; return the scaled advantages."""
         multipliers = self.move(experience.constraints)
         if self._is_relative:
-            scaled = self._units.of(experience.advantages)
+            scaled = self._units.of(experience.advantages, experience.constraints.limits)
             return Penalty(scaled.rewards, scaled.costs, multipliers, multipliers * scaled.exchange_rates)
         centred = experience.advantages - experience.advantages.mean(axis=0)
         return Penalty(centred[:, 0] / reward_spread(centred), centred[:, 1:], multipliers, multipliers)

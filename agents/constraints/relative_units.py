@@ -22,8 +22,8 @@ from recrl.agents.building_blocks.scales import RunningScale, quotient
 from recrl.agents.experience import ActiveConstraints, Experience
 from recrl.environments.cmdp import Floats
 
-# Of the reward's advantages in a rollout, relative to those of a cost. In a rollout with equal rewards the
-# advantages of costs would be scaled without bound, and Adam would remember it for thousands of steps.
+# Smallest spread of the reward's advantages in a rollout, as a fraction of a cost's in the same unit. If all
+# rewards are equal, costs would be scaled without bound, and Adam would remember it for thousands of steps.
 LEAST_SPREAD = 0.1
 
 
@@ -34,9 +34,9 @@ class RelativeAdvantages:
     Attributes:
         rewards: standardised advantages, [N]; smaller in a rollout in which costs differ much more.
         costs: centred advantages of each cost times its ``factors``, [N, k].
-        factors: u_i / the spread of the reward's advantages in this rollout, or, if that is larger,
-            / ``LEAST_SPREAD`` of a cost's in the same unit, [k]; 0 if the cost has not occurred. Before any
-            reward, 1 / the spread of the cost's: costs are avoided from the start.
+        factors: u_i / s, [k]; 0 if the cost has not occurred. s is the spread of the reward's advantages in
+            this rollout, and at least ``LEAST_SPREAD`` times that of each limited cost's, in units of reward.
+            Before any reward, 1 / the spread of the cost's: costs are avoided from the start.
         exchange_rates: u, reward per unit of cost, [k]; 0 before any reward or cost i.
     """
 
@@ -56,13 +56,18 @@ class RelativeUnits:
     def __init__(self, num_costs: int) -> None:
         self._spreads = RunningScale(1 + num_costs)
 
-    def of(self, advantages: Floats) -> RelativeAdvantages:
-        """Include a rollout's raw advantages, [N, 1 + k], in the spreads, and scale them."""
+    def of(self, advantages: Floats, limits: Floats) -> RelativeAdvantages:
+        """Include a rollout's advantages in the spreads, and scale them.
+
+        Args:
+            advantages: raw, [N, 1 + k].
+            limits: in force, [k]; a cost whose limit is infinite does not count for the scale.
+        """
         centred = advantages - advantages.mean(axis=0)
         self._spreads.add((centred**2).mean(axis=0))
         of_reward, of_costs = self._spreads.values[:1], self._spreads.values[1:]
         exchange_rates = quotient(of_reward, of_costs)
-        in_reward = exchange_rates * centred[:, 1:].std(axis=0)
+        in_reward = np.where(np.isfinite(limits), exchange_rates * centred[:, 1:].std(axis=0), 0.0)
         spread = max(reward_spread(centred), LEAST_SPREAD * float(in_reward.max(initial=0.0)))
         factors = exchange_rates / spread if of_reward > 0.0 else quotient(np.ones(1), of_costs)
         return RelativeAdvantages(centred[:, 0] / spread, centred[:, 1:] * factors, factors, exchange_rates)
@@ -81,7 +86,7 @@ class RelativeConstraints:
     """The constraints that can bind, in the units of ``RelativeAdvantages``.
 
     Attributes:
-        rewards: standardised advantages, [N].
+        rewards: see ``RelativeAdvantages``, [N].
         costs: centred advantages of these costs times their factors, [N, j].
         violations: (mean episode cost - limit) / mean episode length, times the factors, [j].
         index: of the j costs, [j].
@@ -97,7 +102,8 @@ class RelativeConstraints:
     @classmethod
     def of(cls, experience: Experience, units: RelativeUnits) -> RelativeConstraints:
         """Include the rollout's advantages in the units, and scale advantages and known gaps."""
-        scaled, active = units.of(experience.advantages), ActiveConstraints.of(experience.constraints)
+        scaled = units.of(experience.advantages, experience.constraints.limits)
+        active = ActiveConstraints.of(experience.constraints)
         occurred = scaled.factors[active.index] > 0.0
         index = active.index[occurred]
         violations = scaled.factors[index] * active.violations[occurred]

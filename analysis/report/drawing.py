@@ -77,7 +77,7 @@ def sketch(sweep: Sweep, folder: Path, *, averaging: CurveAverage = MEAN) -> lis
 def _draw(
     sweep: Sweep, folder: Path, figures: Mapping[str, Drawing], *, unfinished: bool = False
 ) -> list[Path]:
-    """Draw figures, write all tables and the report; of an unfinished sweep few PNGs, with a note."""
+    """Draw figures, write tables and report; of an unfinished sweep only the fast ones, as PNGs."""
     later = {stem for stem, it in figures.items() if unfinished and it.kind not in SKETCHED}
     earlier = shown_figures(folder)
     drawn, mistakes = [], _Mistakes()

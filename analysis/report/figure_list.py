@@ -42,6 +42,9 @@ CAPTIONS = {
 SKETCHED = ("return-against-cost", "learning-curves", "curricula")
 
 
+KINDS = frozenset({*CAPTIONS, "bounds"})
+
+
 @dataclass(frozen=True)
 class Drawing:
     """A figure that can be drawn.

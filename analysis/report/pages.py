@@ -15,7 +15,7 @@ from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import attempts, doubts
 from recrl.analysis.report import html_page, table_formats
-from recrl.analysis.report.figure_list import SKETCHED, Drawing, without_episodes
+from recrl.analysis.report.figure_list import KINDS, SKETCHED, Drawing, without_episodes
 from recrl.analysis.report.html_page import Section
 from recrl.analysis.report.table_files import Tables
 from recrl.analysis.report.verdict_answers import answers, no_verdict
@@ -51,12 +51,13 @@ def write_reports(
 
 
 def shown_figures(folder: Path) -> set[str]:
-    """Return the file stems of the figures that the report in a folder shows; empty without a report."""
+    """Return the file stems of recrl's figures that the report in a folder shows; empty without a report."""
     try:
         text = (folder / "report.md").read_text(encoding="utf-8")
     except (FileNotFoundError, UnicodeDecodeError):
         return set()
-    return set(re.findall(r"^!\[([\w.+-]+)\]\(\1\.png\)$", text, re.MULTILINE))
+    stems = re.findall(r"^!\[([\w.+-]+)\]\(\1\.png\)$", text, re.MULTILINE)
+    return {stem for stem in stems if stem.partition("_")[0] in KINDS}
 
 
 def _html(sweep: Sweep, drawn: list[Path], figures: Mapping[str, Drawing], tables: Tables) -> str:

@@ -28,6 +28,8 @@ def run_bound(request: BoundRequest, console: Console) -> ExitCode:
     from recrl.analysis.report import text_tables  # noqa: PLC0415  (imports pandas and SciPy)
     from recrl.analysis.statistics import cumulative_cost  # noqa: PLC0415
 
+    if request.budget is not None and not request.budget >= 0.0:
+        raise RecrlError(f"--budget: must be at least 0, got {request.budget:g}")
     sweep, _ = source(request)
     say_warnings(sweep, console)
     try:
@@ -45,10 +47,7 @@ def run_bound(request: BoundRequest, console: Console) -> ExitCode:
         "–: not known for this agent or task.",
     )
     if request.budget is not None:
-        try:
-            allowed = cumulative_cost.admissible_limits(rows, sweep, budget=request.budget)
-        except ValueError as error:
-            raise RecrlError(f"--{error}") from error
+        allowed = cumulative_cost.admissible_limits(rows, sweep, budget=request.budget)
         say(
             console,
             f"\nThe largest training limit d_t within {request.budget:g} of net cost above the deployment "

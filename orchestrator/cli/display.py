@@ -28,6 +28,7 @@ LOG_SECONDS = 0.5
 SHOWN_RUNNING = 8
 WRAPPED = ("verdict", "summary")  # columns of sentences, wrapped on a narrow terminal
 
+FROM_THE_BEGINNING = (PlannedAction.REPAIR, PlannedAction.DAMAGED, PlannedAction.RERUN)
 _STYLES = {
     "complete": "green",
     "running": "cyan",
@@ -39,9 +40,6 @@ _STYLES = {
     "retry": "yellow",
     "resume": "yellow",
 }
-
-
-FROM_THE_BEGINNING = (PlannedAction.REPAIR, PlannedAction.DAMAGED, PlannedAction.RERUN)
 
 
 def plan_table(plan: Plan) -> Table:

@@ -187,9 +187,10 @@ def _check_decay(spec: TrialSpec, cmdp: CMDPSpec) -> None:
         return
     step, state = teacher.start()
     updates = -(-spec.train_steps // spec.steps_per_update)
-    for update in np.unique(np.linspace(1, updates, min(updates, CHECKED_UPDATES), dtype=int)).tolist():
+    chosen = np.linspace(1, updates, min(updates, CHECKED_UPDATES), dtype=int).tolist()
+    for number, update in enumerate(chosen, 1):  # reports have consecutive numbers
         before = step.limits
-        step, state = teacher.step(state, ProgressReport(update, update * spec.steps_per_update, ()))
+        step, state = teacher.step(state, ProgressReport(number, update * spec.steps_per_update, ()))
         check_limits_fall(
             step,
             before,

@@ -86,7 +86,7 @@ def open_ui(store: SweepStore, uri: str, *, port: int = 5000) -> UI:
     with open(os.open(log_path, flags, 0o600), "wb") as log:
         environment = {**os.environ, "MLFLOW_BACKEND_STORE_URI": uri}
         server = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
-    ui = UI(url, server)
+        ui = UI(url, server)
     try:
         if not _starts(server, port):
             raise TrackingError(

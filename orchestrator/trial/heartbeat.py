@@ -23,7 +23,7 @@ logger = logging.getLogger("recrl.trial")
 
 
 class Heartbeat:
-    """A sign of life for a thread while it computes; see ``beating``.
+    """Writer of signs of life while a thread computes; see ``beating``.
 
     Args:
         beat: writes a sign of life; may raise LostLeaseError.

@@ -19,11 +19,13 @@ from recrl.environments.cmdp import CMDPSpec, CostLimits, CurriculumStep, Floats
 # Spreads of the reward and of two costs: 4, 2 and 0; the third never occurred.
 ADVANTAGES = np.array([[5.0, 7.0, 0.0, 1.0], [-3.0, 3.0, 0.0, 3.0]])
 
+LIMITS = np.array([5.0, 5.0, 5.0])
+
 
 def test_two_rollouts_by_hand() -> None:
     """The spreads are root mean squares over both rollouts: of the reward sqrt((16 + 1) / 2), of cost 0 2."""
     units = RelativeUnits(3)
-    first = units.of(ADVANTAGES)
+    first = units.of(ADVANTAGES, LIMITS)
     assert first.rewards.tolist() == [1.0, -1.0]
     assert first.exchange_rates.tolist() == [2.0, 0.0, 4.0]
     assert first.costs[:, 0].tolist() == [1.0, -1.0]
@@ -32,7 +34,7 @@ def test_two_rollouts_by_hand() -> None:
     resumed.load_state_dict(units.state_dict())
     second = np.array([[2.0, 7.0, 0.0, 1.0], [0.0, 3.0, 0.0, 3.0]])
     for each in (units, resumed):
-        found = each.of(second)
+        found = each.of(second, LIMITS)
         assert found.rewards.tolist() == [1.0, -1.0]
         assert found.exchange_rates[0] == pytest.approx(math.sqrt(8.5) / 2.0)
         # The reward's spread in this rollout is 1.
@@ -59,7 +61,7 @@ def test_a_cost_can_bind_if_it_has_a_limit_and_has_occurred() -> None:
 
 
 def test_before_any_reward_costs_count_in_their_own_spread() -> None:
-    found = RelativeUnits(3).of(ADVANTAGES * np.array([0.0, 1.0, 1.0, 1.0]))
+    found = RelativeUnits(3).of(ADVANTAGES * np.array([0.0, 1.0, 1.0, 1.0]), LIMITS)
     assert found.rewards.tolist() == [0.0, 0.0]
     assert found.costs.tolist() == [[1.0, 0.0, -1.0], [-1.0, 0.0, 1.0]]
     assert found.exchange_rates.tolist() == [0.0, 0.0, 0.0]
@@ -68,12 +70,20 @@ def test_before_any_reward_costs_count_in_their_own_spread() -> None:
 def test_in_a_rollout_with_equal_rewards_costs_have_a_tenth_of_their_spread_as_unit() -> None:
     """The running spreads are sqrt((16 + 0) / 2) of the reward and 2 of cost 0; 1 / 0.1 is the cost's."""
     units = RelativeUnits(3)
-    units.of(ADVANTAGES)
-    found = units.of(ADVANTAGES * np.array([0.0, 1.0, 1.0, 1.0]))
+    units.of(ADVANTAGES, LIMITS)
+    found = units.of(ADVANTAGES * np.array([0.0, 1.0, 1.0, 1.0]), LIMITS)
     assert found.rewards.tolist() == [0.0, 0.0]
     assert found.exchange_rates.tolist() == pytest.approx([math.sqrt(8.0) / 2.0, 0.0, math.sqrt(8.0)])
     assert found.costs[:, 0].tolist() == pytest.approx([10.0, -10.0])
     assert found.costs[:, 2].tolist() == pytest.approx([-10.0, 10.0])
+
+
+def test_a_cost_without_a_limit_does_not_scale_the_reward() -> None:
+    units = RelativeUnits(3)
+    units.of(ADVANTAGES, LIMITS)
+    small = ADVANTAGES * np.array([0.01, 1.0, 1.0, 1.0])
+    assert units.of(small, np.full(3, math.inf)).rewards.tolist() == pytest.approx([1.0, -1.0])
+    assert units.of(small, LIMITS).rewards.max() < 0.2
 
 
 def test_a_rollout_without_reward_does_not_stop_later_learning() -> None:

@@ -199,10 +199,14 @@ def test_figures_that_an_earlier_report_shows_are_drawn_again_or_removed(
     before = figures()
     for suffix in ("png", "pdf"):
         (tmp_path / f"learning-curves_mine.{suffix}").write_text("the user's")
+        (tmp_path / f"photo.{suffix}").write_text("the user's")
+    report = tmp_path / "report.md"
+    report.write_text(f"{report.read_text()}\n![photo](photo.png)\n")
+    own = {"learning-curves_mine", "photo"}
     drawing.sketch(one, tmp_path)
     gone = {stem for stem in before if "ppo-lag" in stem}
     assert gone
-    assert figures() == (before | {"learning-curves_mine"}) - gone
+    assert figures() == (before | own) - gone
 
     def mistaken(*_: object, **__: object) -> None:
         raise KeyError("river")
@@ -211,7 +215,7 @@ def test_figures_that_an_earlier_report_shows_are_drawn_again_or_removed(
     monkeypatch.setattr(learning_curves, "curricula", mistaken)
     with pytest.raises(KeyError, match="river"):
         drawing.draw(one, tmp_path)
-    assert figures() == (before | {"learning-curves_mine"}) - gone - {"curricula"}
+    assert figures() == (before | own) - gone - {"curricula"}
 
 
 def test_nothing_to_draw_is_one_clear_sentence(tmp_path: Path) -> None:

@@ -869,7 +869,9 @@ def test_a_grid_too_short_for_a_deployment_phase_is_a_warning(
 def test_a_training_shorter_than_an_episode_is_a_warning(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (folder / "grid.yaml").write_text(GRID.replace("total_steps: 160", "total_steps: 60"))
+    (folder / "grid.yaml").write_text(
+        GRID.replace("{name: two-state,", "{name: two-state, options: {horizon: 21},")
+    )
     assert main(["validate", "grid.yaml"]) == ExitCode.OK
     assert (
         "warning: training gives each environment fewer steps than an episode may have, so maybe no episode "
@@ -884,7 +886,7 @@ def test_a_curriculum_that_relaxes_no_limit_is_a_warning(
     assert main(["validate", "grid.yaml"]) == ExitCode.OK
     [warning] = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: ")]
     assert warning == (
-        "warning: train_limits equal deploy_limits, so that the curriculum relaxes no limit: "
+        "warning: train_limits equal deploy_limits, so that the limits are d_d from the start: "
         "two-state ppo-lag linear seed 0; give larger train_limits, or auto"
     )
 

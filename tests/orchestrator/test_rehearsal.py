@@ -1,6 +1,7 @@
 """The user's own parts are tried before a launch: do they work, and do they resume exactly?"""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -231,6 +232,7 @@ def problems(
     agents: Sequence[str] = ("cpo",),
     methods: Sequence[str] = ("none",),
     train_limits: str = "5",
+    total_steps: int = 10_000,
 ) -> list[str]:
     data = f"""\
 name: own
@@ -238,7 +240,7 @@ tasks: [{{name: "{task}", deploy_limits: 2, train_limits: {train_limits}}}]
 agents: {list(agents)}
 methods: {list(methods)}
 seeds: 1
-run: {{total_steps: 10_000}}
+run: {{total_steps: {total_steps}}}
 """
     try:
         parse_grid(data.encode(), source="grid.yaml", build=True)
@@ -337,9 +339,12 @@ def test_a_curriculum(curriculum: str, sentence: str) -> None:
         ("RISING", "curriculum own_rehearsed:RISING: the limit of wear rose from 2"),
     ],
 )
-@pytest.mark.parametrize("train_limits", ["5", "auto"])
-def test_a_decay_is_checked_up_to_its_end(curriculum: str, sentence: str, train_limits: str) -> None:
-    (problem,) = problems(methods=[f"own_rehearsed:{curriculum}"], train_limits=train_limits)
+@pytest.mark.parametrize(("train_limits", "total_steps"), [("5", 10_000), ("auto", 10_000), ("5", 1_000_000)])
+def test_a_decay_is_checked_up_to_its_end(
+    curriculum: str, sentence: str, train_limits: str, total_steps: int
+) -> None:
+    of = partial(problems, train_limits=train_limits, total_steps=total_steps)
+    (problem,) = of(methods=[f"own_rehearsed:{curriculum}"])
     assert f"own_rehearsed:{curriculum} fails later in training on two-state: ValueError: " in problem
     assert sentence in problem
-    assert problems(methods=["own_rehearsed:STRAIGHT"], train_limits=train_limits) == []
+    assert of(methods=["own_rehearsed:STRAIGHT"]) == []
