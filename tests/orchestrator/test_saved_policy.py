@@ -135,7 +135,7 @@ def test_an_evaluation_ends_although_only_some_episodes_do(
 
     monkeypatch.setattr(Collector, "collect", without_the_second)
     policy, seed = SavedTrial.load(complete).policy, np.random.SeedSequence(0)
-    with pytest.raises(RuntimeError, match=f"no episode ended in {most} steps of environment 0"):
+    with pytest.raises(RuntimeError, match=f"no episode ended in {most} steps of environment 1"):
         evaluate(policy, environments, FrozenPolicy.STOCHASTIC, num_episodes=8, seed=seed)
 
 
