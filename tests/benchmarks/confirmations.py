@@ -1,4 +1,4 @@
-"""Judge the confirmations on Safety Gym by the rules that their grids set before they ran.
+"""Judge experiments on Safety Gym by the rules that their grids set before they ran.
 
     python -m tests.benchmarks.confirmations results/safety-gym/button-confirm.csv \
         --earlier results/safety-gym/curricula-today.csv results/safety-gym/table.csv
@@ -6,7 +6,7 @@
 The tables are those of ``final_policies.py``; the task of the first one says which rule it is. Printed are
 the conditions of the rule, for ppo-lag's final stochastic policies. Then come the differences of linear from
 none in return and cost, with 95% intervals, paired (Student) and as two groups (Welch): of these seeds, of
-these with the first earlier table, and of all.
+these with the first earlier table if there is one, and of all.
 """
 
 from __future__ import annotations
@@ -55,6 +55,7 @@ class Rule:
 RULES = {
     "CarButton2": Rule([120, 121, 122], every_pair_earns_more),
     "CarGoal2": Rule([120, 121, 122, 123, 124, 125], groups_earn_less),
+    "CarGoal1": Rule([117, 118, 119], groups_earn_less),
 }
 
 
@@ -97,7 +98,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("fresh", type=Path)
-    parser.add_argument("--earlier", type=Path, nargs="+", required=True)
+    parser.add_argument("--earlier", type=Path, nargs="+", default=[])
     given = parser.parse_args()
     fresh = pd.read_csv(given.fresh)
     [task] = fresh["task"].unique()

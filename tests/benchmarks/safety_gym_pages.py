@@ -32,6 +32,8 @@ CONFIRMATIONS = ("button-confirm", "goal-confirm")
 CONTROLS = ("controls", "early-landing", "short-training")  # with rows of the deployment phase, as the table
 AGENTS = ("ppo-lag", "cpo")
 TASKS = ("CarGoal2", "CarButton2", "CarPush2")
+LEVEL_1 = "level1"
+LEVEL_1_TASKS = ("CarGoal1", "CarButton1", "CarPush1")
 STEPS_UNDER_LIMIT = ("none", "none-short", "linear", "linear-early")  # differ in these on CarGoal2
 NOISE = ("none", "dynamic", "dynamic-without-noise")
 CURRICULA = (*STEPS_UNDER_LIMIT, "cosine", "exponential", *NOISE[1:], "step")
@@ -45,7 +47,7 @@ Key = tuple[str, str, str]  # agent, task, curriculum
 def rows_of(*names: str) -> pd.DataFrame:
     """Return rows of several files in the results, in the order of the pages."""
     rows = pd.concat([pd.read_csv(RESULTS / name, comment="#") for name in names], ignore_index=True)
-    orders = {"agent": AGENTS, "task": TASKS, "method": CURRICULA}
+    orders = {"agent": AGENTS, "task": (*TASKS, *LEVEL_1_TASKS), "method": CURRICULA}
     ranks = [rows[name].map(order.index) for name, order in orders.items()]
     return rows.loc[pd.concat(ranks, axis=1).sort_values(list(orders)).index]
 
@@ -209,7 +211,7 @@ def tables() -> Iterator[tuple[Path, str, list[str]]]:
         (DETAILS, "claims", claims(pd.read_csv(RESULTS / CLAIMS))),
         (DETAILS, "pilot", policies(seen)),
         (DETAILS, "deployment phase", deployment_phase(phase)),
-        *((DETAILS, name, policies(rows_of(f"{name}.csv"))) for name in CONFIRMATIONS),
+        *((DETAILS, name, policies(rows_of(f"{name}.csv"))) for name in (*CONFIRMATIONS, LEVEL_1)),
         (DETAILS, "steps under the limit", policies(of_question(everything, STEPS_UNDER_LIMIT))),
         (DETAILS, "noise", policies(of_question(current, NOISE))),
     )

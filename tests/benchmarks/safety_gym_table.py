@@ -29,6 +29,7 @@ from tests.benchmarks.safety_gym_pages import (
     CONFIRMATIONS,
     CONTROLS,
     FRESH,
+    LEVEL_1,
     MULTIPLIERS,
     NOISE,
     PILOT,
@@ -67,7 +68,7 @@ def archive_of(name: str) -> Path:
 def write_rows_and_tests(archives: Mapping[str, Path]) -> None:
     """Write the rows of the table, and the tests."""
     scripts = "../../tests/benchmarks"
-    finals = {**archives, **{name: archive_of(name) for name in CONFIRMATIONS}}
+    finals = {**archives, **{name: archive_of(name) for name in (*CONFIRMATIONS, LEVEL_1)}}
     rows = [f"{scripts}/final_policies.py {path} --to {it}.csv" for it, path in finals.items()]
     phases = [
         f"{scripts}/deployment_phase.py {path} --to {it}-deployment-phase.csv"
