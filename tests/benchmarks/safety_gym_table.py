@@ -90,8 +90,9 @@ def write_rows_and_tests(archives: Mapping[str, Path]) -> None:
     ]
     (RESULTS / "power.txt").write_text(transcript(powers, ROOT))
     earlier = f"results/safety-gym/{PILOT[0]} results/safety-gym/table.csv"
-    for name in CONFIRMATIONS:
-        judge = f"-m tests.benchmarks.confirmations results/safety-gym/{name}.csv --earlier {earlier}"
+    for name in (*CONFIRMATIONS, LEVEL_1):
+        before = f" --earlier {earlier}" if name in CONFIRMATIONS else ""
+        judge = f"-m tests.benchmarks.confirmations results/safety-gym/{name}.csv{before}"
         (RESULTS / f"{name}.txt").write_text(transcript([judge], ROOT))
 
 
