@@ -39,10 +39,8 @@ CAPTIONS = {
     "performance-profiles": "Fraction of final policies that are feasible and return more than the value "
     "below; an infeasible one and a failed trial count as the worst",
 }
+KINDS = frozenset({*CAPTIONS, "bounds"})  # the captions of bounds depend on the sweep
 SKETCHED = ("return-against-cost", "learning-curves", "curricula")
-
-
-KINDS = frozenset({*CAPTIONS, "bounds"})
 
 
 @dataclass(frozen=True)
