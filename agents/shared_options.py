@@ -96,7 +96,7 @@ class ActorCriticConfig(Options):
         description="Import path package.module:function of your own network. The function takes "
         "the numbers of inputs and outputs and returns a torch.nn.Module from [U, "
         "inputs] to [U, outputs]. It makes the policy and every critic. Then "
-        "hidden_sizes, activation, initialisation and last_layer_scale are not used.",
+        "hidden_sizes, activation, initialisation and last_layer_scale must be left out.",
     )
     initialisation: Literal["orthogonal", "xavier"] = Field(
         default="orthogonal", description="Initialisation of the weights (ours; paper xavier)."

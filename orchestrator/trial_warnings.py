@@ -51,6 +51,13 @@ def no_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
     return _warning(what, [spec.title for spec in short], remedy)
 
 
+def absent_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
+    """Return the warning about curricula without a deployment phase; empty for none."""
+    what = "deploy_fraction is 0, so that no update learns under d_d"
+    absent = [spec.title for spec in specs if not spec.deploy_steps and spec.method.name != "none"]
+    return _warning(what, absent, "give a deploy_fraction above 0")
+
+
 def unrelaxed_sentence(specs: Sequence[TrialSpec]) -> str:
     """Return the warning about curricula whose d_t is d_d; empty for none."""
     what = "train_limits equal deploy_limits, so that the limits are d_d from the start"

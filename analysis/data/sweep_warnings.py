@@ -1,4 +1,4 @@
-"""Remarks on the validity of a sweep's numbers: damaged trials, other code, ineffective curricula."""
+"""Remarks on the validity of a sweep's numbers: damage, other code or devices, ineffective curricula."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def damages(sweep: Sweep) -> list[str]:
 
 
 def doubts(sweep: Sweep) -> list[str]:
-    """Return sentences on changed, missing and mixed code, mixed libraries, and ineffective curricula."""
+    """Return sentences on code, libraries and devices that differ, and on ineffective curricula."""
     installed = InstalledCode()
     codes = [compare(attempts(it), it.spec, installed) for it in sweep.facts]
     changed = [it for it, code in zip(sweep.facts, codes, strict=True) if code.differs]
@@ -41,7 +41,7 @@ def doubts(sweep: Sweep) -> list[str]:
     if other and sweep.folder is None:
         other += ", in a sweep's own folder"
     missing = missing_modules_sentence(code.missing for code in codes)
-    mixed = (mixed_code_sentence(sweep), mixed_versions_sentence(sweep))
+    mixed = (mixed_code_sentence(sweep), mixed_versions_sentence(sweep), mixed_devices_sentence(sweep))
     return [*filter(None, (other, missing, *mixed)), *curriculum_warnings(sweep)]
 
 
@@ -64,13 +64,39 @@ def mixed_versions_sentence(sweep: Sweep) -> str:
 
     All attempts of a trial count, because each of them learnt a part of its policy.
     """
-    ran = _ran_by_cell(sweep, lambda known: map(library_versions, known))
+    return _mixed_sentence(sweep, "versions of libraries differ", library_versions)
+
+
+def mixed_devices_sentence(sweep: Sweep) -> str:
+    """Name cells as ``mixed_versions_sentence`` does, whose trials learnt on a processor and on a GPU.
+
+    So does one with GPUs of several kinds. Kinds of processors are not recorded.
+    """
+    return _mixed_sentence(sweep, "devices differ", _device)
+
+
+def _device(attempt: Mapping[str, Any]) -> dict[str, str]:
+    """Return what an attempt learnt on, as one entry; none if there is no record of it."""
+    return {"learnt on": str(attempt["device"])} if "device" in attempt else {}
+
+
+def _mixed_sentence(
+    sweep: Sweep, what: str, of_attempt: Callable[[Mapping[str, Any]], Mapping[str, str]]
+) -> str:
+    """Say where attempts differ in something, and in which values; empty if they do not.
+
+    Args:
+        sweep: the sweep.
+        what: the beginning of the sentence.
+        of_attempt: the values by name.
+    """
+    ran = _ran_by_cell(sweep, lambda known: map(of_attempt, known))
     where = _where_different(ran)
     if not where:
         return ""
     found: _Ran = functools.reduce(_joined, ran.values(), {})
     different = [f"{name} {', '.join(sorted(of))}" for name, of in sorted(found.items()) if len(of) > 1]
-    return f"versions of libraries differ {where}, so a difference may come from them: {'; '.join(different)}"
+    return f"{what} {where}, so a difference may come from them: {'; '.join(different)}"
 
 
 def _ran_by_cell(

@@ -252,7 +252,7 @@ class Run(_Written):
 
 
 class Resources(_Written):
-    """Resources of a trial; no result depends on them."""
+    """Resources of a trial. Results depend only on whether it learns on a GPU, which rounds differently."""
 
     cpus_per_trial: Number = Field(default=1.0, ge=1e-4, le=1024.0, description="Cores of a running trial.")
     gpus_per_trial: Annotated[Number, AfterValidator(_share_or_whole)] = Field(

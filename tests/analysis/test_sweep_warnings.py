@@ -7,7 +7,12 @@ from collections.abc import Mapping
 import pytest
 
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.data.sweep_warnings import doubts, mixed_code_sentence, mixed_versions_sentence
+from recrl.analysis.data.sweep_warnings import (
+    doubts,
+    mixed_code_sentence,
+    mixed_devices_sentence,
+    mixed_versions_sentence,
+)
 from recrl.analysis.report import pages
 
 REMEDY = "in a sweep's own folder, launch --rerun-changed makes it that of the installed version"
@@ -95,6 +100,21 @@ def test_a_curriculum_that_ran_with_other_versions_than_none_is_named(finished: 
         facts.append(dataclasses.replace(it, provenance=json.dumps({"attempts": [attempt]})))
     sentence = mixed_versions_sentence(dataclasses.replace(finished, facts=tuple(facts)))
     assert "between none and curricula compared with it (river-a cpo dynamic)" in sentence
+
+
+def test_seeds_that_learnt_on_other_devices_are_one_sentence(finished: Sweep) -> None:
+    facts = []
+    for it in finished.facts:
+        device = "cuda: H200" if it.spec.title == "river-a cpo linear seed 1" else "cpu"
+        attempts = [{"code": {}}, {"code": {}, "device": device}]
+        facts.append(dataclasses.replace(it, provenance=json.dumps({"attempts": attempts})))
+    sweep = dataclasses.replace(finished, facts=tuple(facts))
+    assert mixed_devices_sentence(finished) == ""
+    assert mixed_devices_sentence(sweep) == (
+        "devices differ between seeds that are averaged (river-a cpo linear), so a difference may come from "
+        "them: learnt on cpu, cuda: H200"
+    )
+    assert mixed_devices_sentence(sweep) in pages.missing(sweep)
 
 
 @pytest.mark.parametrize("packages", [None, [], "text"])

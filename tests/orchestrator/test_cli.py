@@ -866,6 +866,17 @@ def test_a_grid_too_short_for_a_deployment_phase_is_a_warning(
         ) in capsys.readouterr().out.splitlines()
 
 
+def test_a_curriculum_without_a_deployment_phase_is_a_warning(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "grid.yaml").write_text(GRID.replace("deploy_fraction: 0.5", "deploy_fraction: 0"))
+    assert main(["validate", "grid.yaml"]) == ExitCode.OK
+    assert (
+        "warning: deploy_fraction is 0, so that no update learns under d_d: two-state ppo-lag linear seed 0; "
+        "give a deploy_fraction above 0"
+    ) in capsys.readouterr().out.splitlines()
+
+
 def test_a_training_shorter_than_an_episode_is_a_warning(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
