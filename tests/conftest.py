@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 import pytest
@@ -24,6 +24,9 @@ from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
 from recrl.orchestrator.tracking.client import tracking_uri
 from recrl.orchestrator.tracking.mlflow_sync import sync
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 settings.register_profile("recrl", deadline=None)  # a loaded machine is no failure
 settings.load_profile("recrl")
@@ -232,6 +235,17 @@ def unrendered(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def write(figure: object, file: BinaryIO, **options: object) -> None:
         file.write(b"not rendered")
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", write)
+
+
+@pytest.fixture
+def laid_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are laid out with all their texts, but not written: for tests of whether they can be drawn."""
+
+    def write(figure: Figure, file: BinaryIO, **options: object) -> None:
+        figure.draw_without_rendering()
+        file.write(b"laid out")
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", write)
 

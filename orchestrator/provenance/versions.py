@@ -74,10 +74,16 @@ def package_versions(names: Iterable[str]) -> dict[str, str]:
     versions = {}
     for name in names:
         try:
-            versions[name] = version(name)
+            versions[name] = _version(name)
         except PackageNotFoundError:
             continue
     return versions
+
+
+@functools.cache
+def _version(name: str) -> str:
+    """Return the version of a distribution when the process first asked, because reading it is slow."""
+    return version(name)
 
 
 def _dependencies() -> list[str]:

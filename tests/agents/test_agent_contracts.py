@@ -24,7 +24,7 @@ from recrl.environments.registry import make_vector
 from recrl.orchestrator.files.checkpoint_format import decode, encode
 
 TASKS = {"two-state": 3.0, "two-state-2": 3.0, "continuous-bandit": 2.5}
-OPTIONS = {"hidden_sizes": [16, 16], "critic_steps": 5}
+OPTIONS = {"hidden_sizes": [16, 16], "critic_steps": 5, "critic_passes": 1}
 FINITE, SEVERAL_UPDATES = 3.0, 4
 
 

@@ -76,6 +76,13 @@ OTHERS: dict[str, tuple[Any, dict[str, Any]]] = {
 # They need a task with lidars, or a file of the user's: test_observation_features.py, test_module_stack.py.
 ELSEWHERE = {"encoder", "proximity_scales", "network"}
 TASKS = ("two-state-2", "continuous-bandit")
+FEW_STEPS = {
+    "hidden_sizes": [8],
+    "critic_steps": 5,
+    "critic_passes": 1,
+    "policy_steps": 5,
+    "policy_passes": 1,
+}
 
 
 def learnt(agent: str, task: str, options: dict[str, Any]) -> bytes:
@@ -106,9 +113,7 @@ def test_another_value_of_an_option_gives_another_agent(agent: str) -> None:
     without_effect = []
     for option in sorted(known - ELSEWHERE):
         value, needed = OTHERS[option]
-        basis = {"hidden_sizes": [8], "critic_steps": 5} | {
-            name: given for name, given in needed.items() if name in known
-        }
+        basis = {name: given for name, given in (FEW_STEPS | needed).items() if name in known}
         changed = basis | {option: value}
         if all(learnt(agent, task, basis) == learnt(agent, task, changed) for task in TASKS):
             without_effect.append(option)

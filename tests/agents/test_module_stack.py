@@ -143,7 +143,7 @@ def test_a_factor_scales_other_networks_and_is_learnt(factory: Callable[[int, in
 )
 def test_a_policy_that_noise_made_uniform_learns_again(options: dict[str, Any], noise_form: str) -> None:
     environments = make_vector("two-state", 8)
-    settings = {"noise_form": noise_form, **options}
+    settings = {"noise_form": noise_form, "critic_steps": 5, "critic_passes": 1, **options}
     agent = make_agent("ppo-lag", environments.cmdp, settings, np.random.SeedSequence(7))
     collector, generator = Collector(environments, num_steps=20), np.random.default_rng(2)
     collector.reset(seed=1)

@@ -34,7 +34,7 @@ def learnt(
 ) -> npt.NDArray[np.float32]:
     """The actions' probabilities, or the modes, of an agent whose rewards and costs are multiplied."""
     environments = make_vector(task, 8)
-    options = {"hidden_sizes": [16, 16], **options}
+    options = {"hidden_sizes": [16, 16], "critic_steps": 5, "critic_passes": 1, **options}
     learner = make_agent(agent, environments.cmdp, options, np.random.SeedSequence(7))
     collector, generator = Collector(environments, num_steps=40), np.random.default_rng(2)
     collector.reset(seed=1)

@@ -131,6 +131,7 @@ def test_the_only_cost_has_the_index_0(finished: Sweep) -> None:
         indices_of_cost(finished, "1")
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_name_from_an_export_is_no_markup_in_the_report(two: Sweep, tmp_path: Path) -> None:
     drawing.sketch(named(two, ["<img src=x>", "[a](b)"]), tmp_path)
     headings = [line for line in (tmp_path / "report.md").read_text().splitlines() if line[:1] == "#"]

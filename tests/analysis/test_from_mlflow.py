@@ -283,6 +283,7 @@ def test_a_sweep_that_mlflow_does_not_show_is_named(
     assert sentence in str(caught.value)
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_commands_take_mlflow_or_an_export_file_for_the_files(
     sweep: SweepStore,
     exported: Sweep,

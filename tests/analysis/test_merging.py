@@ -162,7 +162,8 @@ def test_each_agent_has_its_own_discount_in_the_bounds(part: Part) -> None:
 
 @pytest.mark.usefixtures("unrendered")
 def test_a_task_of_another_number_of_costs_under_one_label_is_drawn(part: Part, tmp_path: Path) -> None:
-    merged = merge([part("two", num_costs=2), part("one")])
+    few = {"methods": ("none",), "agents": ("cpo",), "seeds": 1}
+    merged = merge([part("two", num_costs=2, **few), part("one", **few)])
     numbers = merged.trials.groupby("task", observed=True)["num_costs"].unique()
     assert sorted(map(list, numbers)) == [[1], [2]]
     assert drawing.draw(merged, tmp_path / "figures")
@@ -206,6 +207,7 @@ def test_a_trial_that_failed_before_its_first_step_is_further_than_one_that_wait
     assert {trial.error for trial in merged.facts} == {"no luck"}
 
 
+@pytest.mark.usefixtures("laid_out")
 def test_figures_need_no_row_of_the_trials_with_most_costs(part: Part, tmp_path: Path) -> None:
     few = {"methods": ("none", "dynamic"), "agents": ("cpo",), "seeds": 1}
     unstarted = part("two", tasks=("b",), num_costs=2, **few)
@@ -252,6 +254,7 @@ def test_trials_completed_in_two_parts_with_other_episodes_are_named(part: Part,
     assert_equal(merged, one)
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_the_command_writes_one_file(part: Part, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = [tmp_path / "one.zip", tmp_path / "two.zip"]
     export.save(part("one", missing=TITLES[4:], unfinished=TITLES[:1]), paths[0])

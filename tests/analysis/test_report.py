@@ -76,6 +76,7 @@ def test_a_partial_sweep_is_drawn_twice_alike_and_says_what_is_missing(
     assert [path.read_bytes() for path in written] == [path.read_bytes() for path in again]
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_before_any_trial_is_complete_there_are_curves_and_no_table(
     made_up_sweep: Callable[..., SweepStore], tmp_path: Path
 ) -> None:
@@ -91,6 +92,7 @@ def test_before_any_trial_is_complete_there_are_curves_and_no_table(
         assert figure_list.drawings(sweep)[stem].make() is None
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_sketch_has_what_changes_while_a_sweep_runs_and_all_tables(
     made_up_sweep: Callable[..., SweepStore], tmp_path: Path
 ) -> None:
@@ -109,6 +111,7 @@ def test_a_sketch_has_what_changes_while_a_sweep_runs_and_all_tables(
     assert text.count("another seed may give another verdict") == 1  # the answers say so, the warnings do not
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_labels_that_differ_only_in_other_signs_have_figures_of_their_own(
     made_up_sweep: Callable[..., SweepStore], tmp_path: Path
 ) -> None:
@@ -167,6 +170,7 @@ def test_a_report_of_failed_trials_alone_says_so(finished: Sweep, tmp_path: Path
         assert "No verdict: all 36 trials failed." in (tmp_path / name).read_text()
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_no_table_or_figure_of_an_earlier_grid_stays_beside_a_new_report(
     finished: Sweep, tmp_path: Path
 ) -> None:
@@ -280,6 +284,7 @@ def test_the_page_holds_everything_and_fetches_nothing(
         assert sentence in reader.text
 
 
+@pytest.mark.usefixtures("laid_out")
 def test_a_sweep_in_which_no_episode_has_finished_can_be_drawn(
     made_up_sweep: Callable[..., SweepStore], tmp_path: Path
 ) -> None:

@@ -1040,6 +1040,7 @@ def test_an_environment_that_cannot_be_closed_is_no_traceback(
     assert "room_closed:Room raised an error when it was closed: RuntimeError: stuck" in caplog.text
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_figures_of_an_export_have_a_folder_of_their_own(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

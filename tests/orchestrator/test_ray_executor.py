@@ -44,9 +44,11 @@ from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, Teacher, TeacherSpec
 
+FEW_CRITIC_STEPS = {"hidden_sizes": [8], "critic_steps": 1, "critic_passes": 1}
+FEW_STEPS = {**FEW_CRITIC_STEPS, "policy_steps": 1, "policy_passes": 1}  # learning is not the question here
 LINEAR = TrialSpec(
     task=Choice("two-state", {"horizon": 10}),
-    agent=Choice("ppo-lag", {"hidden_sizes": [8]}),
+    agent=Choice("ppo-lag", FEW_STEPS),
     method=Choice("linear"),
     train_limits=CostLimits((9.0,)),
     deploy_limits=CostLimits((3.0,)),
@@ -57,9 +59,9 @@ LINEAR = TrialSpec(
     evaluation_episodes=4,
     seed=0,
 )
-DYNAMIC = replace(LINEAR, method=Choice("dynamic", {"window": 2}), agent=Choice("cpo", {"hidden_sizes": [8]}))
+DYNAMIC = replace(LINEAR, method=Choice("dynamic", {"window": 2}), agent=Choice("cpo", FEW_CRITIC_STEPS))
 SWEEP = (LINEAR, DYNAMIC, replace(LINEAR, seed=1), replace(DYNAMIC, seed=1))
-LONG = replace(LINEAR, train_steps=400 * 40, seed=2)  # long enough to be stopped on a fast machine, too
+LONG = replace(LINEAR, train_steps=800 * 40, seed=2)  # long enough to be stopped on a fast machine, too
 BROKEN = replace(LINEAR, method=Choice("linear", {"windw": 8}))
 CRASHING = replace(LINEAR, task=Choice("os:abort"))
 
@@ -139,7 +141,7 @@ def test_a_stopped_sweep_is_finished_by_the_next_run_with_other_workers(
         stop.set()
 
     with once(lambda: store.trial(LONG).record().update >= 20, ask_to_stop):
-        RayExecutor().run((LONG, *SWEEP), SweepPlace(store), stop)
+        RayExecutor(commit_seconds=0.1).run((LONG, *SWEEP), SweepPlace(store), stop)
     assert time.monotonic() - stopped_at[0] < 20.0
     record = store.trial(LONG).record()
     assert record.status is TrialStatus.WAITING

@@ -17,11 +17,34 @@ from tests.faults.chaos import comm, descendants
 
 GRID = """\
 name: bereft
-tasks: [{name: two-state, deploy_limits: 3, options: {horizon: 10}}]
-agents: [{name: ppo-lag, options: {hidden_sizes: [8]}}]
+tasks: [{name: gymnasium, label: waiting, deploy_limits: 3, options: {id: "waiting:Waiting-v0"}}]
+agents:
+  - name: ppo-lag
+    options: {hidden_sizes: [8], critic_steps: 1, critic_passes: 1, policy_steps: 1, policy_passes: 1}
 methods: [linear]
 seeds: 1
-run: {total_steps: 15_000, num_envs: 4, rollout_steps: 10, evaluation_episodes: 4}
+run: {total_steps: 16_000, num_envs: 4, rollout_steps: 10, evaluation_episodes: 4}
+"""
+# A trial takes minutes while the file is there, and seconds without it.
+TASK = """\
+import pathlib, time
+import gymnasium
+import numpy as np
+
+class Waiting(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(0.0, 1.0, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(1, np.float32), {{}}
+    def step(self, action):
+        if pathlib.Path({wait!r}).exists():
+            time.sleep(0.005)
+        self.steps += 1
+        return np.zeros(1, np.float32), 1.0, False, self.steps == 10, {{"cost": float(action)}}
+
+gymnasium.register("Waiting-v0", Waiting)
 """
 COMMAND = [
     sys.executable,
@@ -32,6 +55,16 @@ COMMAND = [
     "--no-figures",
     "--no-mlflow",
 ]
+
+
+@pytest.fixture
+def wait(tmp_path: Path) -> Path:
+    """The file that makes trials wait, beside a grid of one trial and its task."""
+    file = tmp_path / "wait"
+    file.touch()
+    (tmp_path / "waiting.py").write_text(TASK.format(wait=str(file)))
+    (tmp_path / "grid.yaml").write_text(GRID)
+    return file
 
 
 def launch(folder: Path, *options: str) -> subprocess.Popen[str]:
@@ -63,9 +96,8 @@ def running_trial(store: SweepStore, *, after: int = 0) -> int:
     ],
 )
 def test_a_dead_service_of_ray_ends_the_launch_with_a_sentence_and_leaves_no_process(
-    title: str, said: str, tmp_path: Path
+    title: str, said: str, wait: Path, tmp_path: Path
 ) -> None:
-    (tmp_path / "grid.yaml").write_text(GRID.replace("15_000", "50_000"))  # the launch must notice the death
     store = SweepStore(tmp_path / "runs", "bereft")
     driver = launch(tmp_path)
     trial = running_trial(store)
@@ -81,6 +113,7 @@ def test_a_dead_service_of_ray_ends_the_launch_with_a_sentence_and_leaves_no_pro
         time.sleep(0.1)
     assert comm(trial) == ""
     assert all(it.record().update < it.spec.num_updates for it in store.trials())  # it died in the middle
+    wait.unlink()
     again = launch(tmp_path, "--executor", "inline")  # the files are what matters, and it starts sooner
     _, errors = again.communicate(timeout=300.0)
     assert again.returncode == ExitCode.OK, errors
@@ -88,10 +121,9 @@ def test_a_dead_service_of_ray_ends_the_launch_with_a_sentence_and_leaves_no_pro
 
 
 def test_the_next_launch_ends_what_a_killed_one_left_and_sigterm_to_a_worker_is_no_failure(
-    tmp_path: Path,
+    wait: Path, tmp_path: Path
 ) -> None:
     """A batch system that takes a node away sends SIGTERM to the workers."""
-    (tmp_path / "grid.yaml").write_text(GRID)
     store = SweepStore(tmp_path / "runs", "bereft")
     driver = launch(tmp_path)
     first = running_trial(store)
@@ -102,6 +134,7 @@ def test_the_next_launch_ends_what_a_killed_one_left_and_sigterm_to_a_worker_is_
     assert all(it.record().update < it.spec.num_updates for it in store.trials())  # it died in the middle
     again = launch(tmp_path)
     os.kill(running_trial(store, after=first), signal.SIGTERM)
+    wait.unlink()
     _, errors = again.communicate(timeout=300.0)
     assert again.returncode == ExitCode.OK, errors
     end = time.monotonic() + 30.0  # a killed process of a busy machine needs a moment

@@ -1003,7 +1003,7 @@ def wait_until(condition: Callable[[], bool], *, seconds: float = 120.0) -> None
 
 
 def test_a_killed_sync_leaves_nothing_lost_and_nothing_twice(write: Callable[..., SweepStore]) -> None:
-    store = write(seeds=4)
+    store = write(seeds=2)
     uri = tracking_uri(store, None)
     background = start_sync(store, uri, interval_seconds=3600.0)
     wait_until(lambda: any(store.sync_folder.glob("*/trial-*.json")))
@@ -1018,7 +1018,7 @@ def test_a_killed_sync_leaves_nothing_lost_and_nothing_twice(write: Callable[...
 
 
 def test_a_sync_that_is_stopped_shows_everything_first(write: Callable[..., SweepStore]) -> None:
-    store = write(unfinished=(DYNAMIC,))
+    store = write(updates=10, unfinished=(DYNAMIC,))
     uri = tracking_uri(store, None)
     background = start_sync(store, uri, interval_seconds=3600.0)
     wait_until(lambda: mlflow_sync.last_report(store, uri) is not None)
@@ -1032,7 +1032,7 @@ def test_a_sync_that_is_stopped_shows_everything_first(write: Callable[..., Swee
 
 
 def test_a_sync_ends_with_its_parent_and_leaves_the_truth(write: Callable[..., SweepStore]) -> None:
-    store = write()
+    store = write(updates=10)
     uri = tracking_uri(store, None)
     program = (
         "import os, sys; from pathlib import Path; "

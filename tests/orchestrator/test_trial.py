@@ -36,7 +36,7 @@ from recrl.teachers.static import NoConfig, step_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 
 SMALL = {"hidden_sizes": [16]}
-QUICK = {**SMALL, "critic_steps": 4}  # for what holds however long critics are fitted
+QUICK = {**SMALL, "critic_steps": 4, "critic_passes": 1}  # for what holds however long critics are fitted
 SPEC = TrialSpec(
     task=Choice("two-state", {"horizon": 10}),
     agent=Choice("ppo-lag", SMALL),

@@ -328,6 +328,7 @@ def test_labels_are_text_in_latex_and_markdown() -> None:
     )
 
 
+@pytest.mark.usefixtures("laid_out")
 def test_no_label_costs_a_figure(foreign: Path) -> None:
     labels = [r"$\frac{", "$", "a $d_d$ $", r"\$x$y", "50% & #1_2^3"]
     tasks = [{"name": "two-state", "label": label, "deploy_limits": 2} for label in labels]

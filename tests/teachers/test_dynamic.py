@@ -346,7 +346,7 @@ def test_no_decision_comes_from_fewer_than_ten_and_ten_episodes(monkeypatch: Any
     spec = TeacherSpec("dynamic", {"window": 5}, CostLimits((200.0,)), CostLimits((25.0,)), 1_000_000)
     teacher = make_teacher(spec)
     step, state = teacher.start()
-    for update in range(1, 1000):
+    for update in range(1, 400):
         count = 4 * ((256 * update) // 4000 > (256 * (update - 1)) // 4000)  # four end together
         episodes = tuple(
             EpisodeStats(b, Phase.TRAINING, 0, 1000, 10.0, (float(cost),), step.limits, 0.0)
