@@ -35,7 +35,10 @@ def hard_landing_sentence(titles: Sequence[str]) -> str:
     """Return the warning about trials that ``landed_hard``; empty for none."""
     what = "hard landing, the limit was still far above d_d when deployment began"
     return _warning(
-        what, titles, "give the curriculum more steps or a smaller d_t, or dynamic a smaller window"
+        what,
+        titles,
+        "give the curriculum more steps or a smaller d_t, or dynamic a smaller window; a decay of your own "
+        "should end at d_d",
     )
 
 

@@ -80,11 +80,14 @@ def sentences(error: ValidationError, model: type[BaseModel] | None) -> Iterator
         model: the class that was validated, to name the nearest known key; None if unknown.
     """
     items = error.errors(include_url=False)
+    wrong = {item["loc"][:length] for item in items for length in range(len(item["loc"]))}
     unknown = [item["loc"] for item in items if item["type"] == "extra_forbidden"]
     meant = {(*it[:-1], _intended(str(it[-1]), known_keys(model, it[:-1]))) for it in unknown}
     for item in items:
         place, kind = item["loc"], item["type"]
         if kind == "missing" and place in meant:
+            continue
+        if kind == "too_short" and place in wrong:  # pydantic does not count its wrong entries
             continue
         if kind == "extra_forbidden":
             yield place, _unknown_key(str(place[-1]), known_keys(model, place[:-1]))

@@ -115,12 +115,12 @@ def _allowed(limit: float, *, exact: bool) -> str:
     >>> _allowed(1.0, exact=True), _allowed(25.0, exact=False)
     ('allowed 1.01 (1%, exact)', 'allowed 25.25, or 25 + SE if that is more')
     >>> _allowed(0.0, exact=True)
-    'allowed 0.01 (as the limit is 0, exact)'
+    'allowed 0.01 (as the limit is 0)'
     """
-    most = limit + COST_TOLERANCE * (limit if limit > 0.0 else 1.0)
-    share = f"{COST_TOLERANCE:.0%}" if limit > 0.0 else "as the limit is 0"
-    how = f" ({share}, exact)" if exact else f", or {limit:g} + SE if that is more"
-    return f"allowed {most:g}{how}"
+    if limit == 0.0:
+        return f"allowed {COST_TOLERANCE:g} (as the limit is 0)"
+    how = f" ({COST_TOLERANCE:.0%}, exact)" if exact else f", or {limit:g} + SE if that is more"
+    return f"allowed {(1.0 + COST_TOLERANCE) * limit:g}{how}"
 
 
 def _training_limits(trials: pd.DataFrame, i: int) -> str:

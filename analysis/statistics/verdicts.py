@@ -1,8 +1,9 @@
 """Verdicts on a policy: feasible, solved.
 
 There is one tolerance. Feasible means that every mean cost is at most its limit plus ``tolerance``. This is a
-fraction COST_TOLERANCE of the limit, or one standard error of the mean if that is larger. A policy with
-softmax outputs cannot meet a limit exactly like the optimum, because each action keeps some probability.
+fraction COST_TOLERANCE of the limit, or one standard error of the mean if that is larger. Under a limit of 0
+it is COST_TOLERANCE, in episode cost: no cost is negative, so one that was seen proves a violation. A policy
+with softmax outputs cannot meet a limit exactly like the optimum, because each action keeps some probability.
 
 Solved (the column ``optimal``) means feasible and at most SOLVED_GAP below J*(d_d), if that is known.
 """
@@ -68,9 +69,14 @@ def tolerance(limits: pd.Series[float], errors: pd.Series[float]) -> pd.Series[f
     Args:
         limits: d_d,i; at a limit of 0 the tolerance is COST_TOLERANCE itself.
         errors: standard errors of the mean costs; NaN counts as 0.
+
+    >>> tolerance(pd.Series([25.0, 25.0, 0.0]), pd.Series([0.1, 3.0, 3.0])).round(6).tolist()
+    [0.25, 3.0, 0.01]
     """
-    share = COST_TOLERANCE * limits.where(limits > 0.0, 1.0)
-    return pd.Series(np.maximum(share, errors.fillna(0.0)) + ROUNDING * (1.0 + limits), index=limits.index)
+    is_positive = limits > 0.0
+    share = COST_TOLERANCE * limits.where(is_positive, 1.0)
+    known = errors.fillna(0.0).where(is_positive, 0.0)
+    return pd.Series(np.maximum(share, known) + ROUNDING * (1.0 + limits), index=limits.index)
 
 
 def solved(rows: pd.DataFrame) -> pd.Series[bool]:

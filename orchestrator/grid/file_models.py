@@ -69,7 +69,9 @@ def _read_train_limits(value: Any) -> tuple[float, ...]:
 def _read_deploy_limits(value: Any) -> tuple[float, ...]:
     limits = _read_limits(value)
     if not all(math.isfinite(limit) for limit in limits):
-        raise ValueError("must be finite, got infinity")
+        raise ValueError(
+            "must be finite, got infinity; for a cost without a limit give one that no episode can reach"
+        )
     return limits
 
 

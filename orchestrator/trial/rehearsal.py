@@ -26,7 +26,8 @@ from recrl.teachers.teacher import TeacherSpec
 
 UPDATES_BEFORE, UPDATES_AFTER = 2, 3  # the restart; the last update is in the deployment phase
 MOST_ENVIRONMENTS, MOST_STEPS = 2, 16
-REMEDY = "what changes must be in the saved state; reset(seed=...) and the actions must determine an episode"
+SAVED = "what changes must be in the saved state"
+DETERMINED = f"{SAVED}; reset(seed=...) and the actions must determine an episode"
 NOISE = 0.1
 OF_THE_CLOCK = ["time", "collect_seconds", "update_seconds"]
 
@@ -64,7 +65,7 @@ def rehearse(spec: TrialSpec) -> None:
         try:
             resumed = _run(small, spec.teacher, scratch / "resumed", restart=True)
         except USERS_ERRORS as error:
-            raise RestartError(f"{described(error)}; {REMEDY}") from error
+            raise RestartError(f"{described(error)}; {SAVED}") from error
         _compare(whole, resumed)
         try:
             _act(whole)
@@ -78,11 +79,11 @@ def _compare(whole: TrialStore, resumed: TrialStore) -> None:
     for name in rows[0].columns.drop(OF_THE_CLOCK):
         without, after = (each[name].iloc[UPDATES_BEFORE:].to_numpy() for each in rows)
         if not np.array_equal(without, after, equal_nan=without.dtype.kind == "f"):
-            raise RestartError(f"{name} is {after.tolist()} and not {without.tolist()}; {REMEDY}")
+            raise RestartError(f"{name} is {after.tolist()} and not {without.tolist()}; {DETERMINED}")
     states = [_final_state(store) for store in (whole, resumed)]
     for name, state in states[0].items():
         if states[1].get(name) != state:
-            raise RestartError(f"the {name} differs after {UPDATES_AFTER} more updates; {REMEDY}")
+            raise RestartError(f"the {name} differs after {UPDATES_AFTER} more updates; {DETERMINED}")
 
 
 def _final_tree(store: TrialStore) -> dict[str, Any]:

@@ -212,9 +212,11 @@ def _seed_sequence(spec: TrialSpec, seed: int | None) -> np.random.SeedSequence:
 def summary(rows: pd.DataFrame, saved: SavedTrial) -> list[dict[str, Any]]:
     """Summarise an evaluation as text, one row per policy.
 
-    Means have standard errors; ``within`` is the fraction of the episodes in which no cost exceeded its d_d.
+    Means have standard errors, several costs their names; ``within`` is the fraction of the episodes in which
+    no cost exceeded its d_d.
     """
     costs = [f"cost_{i}" for i in range(saved.cmdp.num_costs)]
+    names = [f"{name} " for name in saved.cmdp.cost_names] if len(costs) > 1 else [""]
     limits = saved.spec.deploy_limits.array
     table = []
     for policy in FrozenPolicy:
@@ -229,7 +231,9 @@ def summary(rows: pd.DataFrame, saved: SavedTrial) -> list[dict[str, Any]]:
                 "policy": policy.value,
                 "episodes": str(len(episodes)),
                 "return": _mean_text(episodes["episode_return"]),
-                "costs": ", ".join(_mean_text(episodes[column]) for column in costs),
+                "costs": ", ".join(
+                    f"{name}{_mean_text(episodes[column])}" for name, column in zip(names, costs, strict=True)
+                ),
                 "d_d": ", ".join(f"{limit:g}" for limit in saved.spec.deploy_limits),
                 "within": f"{within:.0%}",
             }

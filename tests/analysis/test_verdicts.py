@@ -16,7 +16,7 @@ from recrl.analysis.report.verdict_table import DEPLOYMENT, verdict_kinds, verdi
 from recrl.analysis.report.verdict_terms import all_exact, explanation, task_sentences
 from recrl.analysis.statistics.comparisons import comparisons
 from recrl.analysis.statistics.verdict_counts import count_verdicts
-from recrl.analysis.statistics.verdicts import exceeded_costs
+from recrl.analysis.statistics.verdicts import exceeded_costs, within_limits
 
 NONE_COMPARED = pd.DataFrame()
 
@@ -52,6 +52,16 @@ ROWS = [
     outcome("none", 0, 1.0, 50.0, measure="deployment"),
     outcome("none", 1, 3.0, 50.0, measure="deployment"),
 ]
+
+
+def test_under_a_limit_of_0_one_violation_that_was_seen_is_one() -> None:
+    """One episode of n with a cost has a mean of one standard error, so the error must not be allowed."""
+    costs = np.zeros(100)
+    costs[3] = 1_000.0
+    error = costs.std(ddof=1) / np.sqrt(len(costs))
+    assert costs.mean() == pytest.approx(error)
+    rows = pd.DataFrame({"cost_0": [10.0, 0.01, 10.0], "cost_0_se": error, "deploy_limit_0": [0.0, 0.0, 5.0]})
+    assert within_limits(rows).tolist() == [False, True, True]
 
 
 def trials_of(rows: list[dict[str, object]], **states: list[dict[str, object]]) -> pd.DataFrame:

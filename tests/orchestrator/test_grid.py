@@ -319,6 +319,11 @@ def test_two_teachers_of_one_kind_need_two_labels() -> None:
         ),
         ("[ppo-lag]", "ppo-lag", "grid.yaml:3: agents: must be a list, got 'ppo-lag'"),
         ("[ppo-lag]", "[]", "grid.yaml:3: agents: must have at least 1 entries, got 0"),
+        (
+            "{name: two-state,",
+            "{name: rivergrid-1a, options: {costs: [rivers]},",
+            "grid.yaml:2: tasks.0.options.costs.0: must be 'river', 'turns' or 'mud', got 'rivers'",
+        ),
         ("[ppo-lag]", "[3]", "grid.yaml:3: agents.0: must be a name or a mapping with a name, got 3"),
         ("[ppo-lag]", "[{label: x}]", "grid.yaml:3: agents.0.name: is required"),
         (
@@ -336,7 +341,8 @@ def test_two_teachers_of_one_kind_need_two_labels() -> None:
         (
             "deploy_limits: 2",
             "deploy_limits: .inf",
-            "grid.yaml:2: tasks.0.deploy_limits: must be finite, got infinity",
+            "grid.yaml:2: tasks.0.deploy_limits: must be finite, got infinity; for a cost without a limit "
+            "give one that no episode can reach",
         ),
         (
             "deploy_limits: 2",

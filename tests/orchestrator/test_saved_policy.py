@@ -189,6 +189,18 @@ def test_a_summary_is_hand_computed(complete: TrialStore) -> None:
     assert (other["policy"], other["return"], other["within"]) == ("deterministic", "5.00", "100%")
 
 
+def test_several_costs_of_a_summary_have_names(complete: TrialStore) -> None:
+    saved = SavedTrial.load(complete)
+    limits = CostLimits((3.0, 0.0))
+    spec = replace(saved.spec, train_limits=limits, deploy_limits=limits)
+    cmdp = replace(saved.cmdp, cost_names=("fuel", "crash"))
+    rows = pd.DataFrame(
+        {"policy": ["stochastic"] * 2, "episode_return": 1.0, "cost_0": [2.0, 4.0], "cost_1": [0.0, 0.0]}
+    )
+    [one] = summary(rows, replace(saved, spec=spec, cmdp=cmdp))
+    assert (one["costs"], one["d_d"]) == ("fuel 3.00 ± 1.00, crash 0.00 ± 0.00", "3, 0")
+
+
 def test_a_film_is_of_the_task_that_was_learnt(crossing: TrialStore) -> None:
     saved = SavedTrial.load(crossing)
     options = RIVER.task.options
