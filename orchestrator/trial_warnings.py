@@ -37,8 +37,8 @@ def hard_landing_sentence(titles: Sequence[str]) -> str:
     return _warning(
         what,
         titles,
-        "give the curriculum more steps or a smaller d_t, or dynamic a smaller window; a decay of your own "
-        "should end at d_d",
+        "give the curriculum more steps or a smaller d_t, dynamic a smaller window, or let a decay of your "
+        "own end at d_d",
     )
 
 
@@ -56,9 +56,14 @@ def no_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
 
 def absent_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
     """Return the warning about curricula without a deployment phase; empty for none."""
-    what = "deploy_fraction is 0, so that no update learns under d_d"
-    absent = [spec.title for spec in specs if not spec.deploy_steps and spec.method.name != "none"]
+    what = "deploy_fraction is 0, so that perhaps no update learns under d_d"
+    absent = [spec.title for spec in specs if not spec.deploy_steps and _is_relaxed(spec)]
     return _warning(what, absent, "give a deploy_fraction above 0")
+
+
+def _is_relaxed(spec: TrialSpec) -> bool:
+    """Whether the limits may differ from d_d in the training phase."""
+    return spec.method.name != "none" and spec.train_limits != spec.deploy_limits
 
 
 def unrelaxed_sentence(specs: Sequence[TrialSpec]) -> str:

@@ -34,8 +34,8 @@ class NetworkArchitecture:
         hidden_sizes: widths of the hidden layers.
         initialiser: draws each weight matrix.
         activation: between the layers; a key of ``ACTIVATIONS`` in ``module_stack``.
-        factory: makes a user's network from the numbers of inputs and outputs; with it the other attributes
-            are not used. None for the standard perceptron.
+        factory: makes a user's network from the numbers of inputs and outputs; then the other attributes have
+            no effect. None for the standard perceptron.
     """
 
     hidden_sizes: tuple[int, ...]

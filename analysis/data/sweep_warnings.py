@@ -70,7 +70,7 @@ def mixed_versions_sentence(sweep: Sweep) -> str:
 def mixed_devices_sentence(sweep: Sweep) -> str:
     """Name cells as ``mixed_versions_sentence`` does, whose trials learnt on a processor and on a GPU.
 
-    So does one with GPUs of several kinds. Kinds of processors are not recorded.
+    Cells with GPUs of several kinds are named, too. Kinds of processors do not count.
     """
     return _mixed_sentence(sweep, "devices differ", _device)
 

@@ -225,8 +225,9 @@ def _outcome_tables(
         rows = averaged[averaged["measure"] == measure.value]
         if len(rows):
             table = table_formats.outcome_table(averaged, measure, suffixes)
-            exact = bool(outcomes.loc[outcomes["measure"] == measure.value, "exact"].all())
-            note = tolerance_sentence(exact=exact) + ("" if exact else f" {SAMPLED}")
+            of_measure = outcomes[outcomes["measure"] == measure.value]
+            exact = bool(of_measure["exact"].all())
+            note = tolerance_sentence(of_measure, exact=exact) + ("" if exact else f" {SAMPLED}")
             note += f" {FAILED_NOTE}" if rows["failed"].any() else ""
             note += f" {counted}" if (counted := table_formats.not_corrected(table)) else ""
             tables.append(ShownTable(_heading(measure), table, note, table_formats.row_kinds(rows)))

@@ -48,7 +48,7 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
         f"{measured_how(verdicts)}.",
         *errors,
         f"Solved: feasible, and within {SOLVED_GAP} of the constrained optimum, where that is known.",
-        tolerance_sentence(exact=all_exact(verdicts)),
+        tolerance_sentence(verdicts, exact=all_exact(verdicts)),
         "The return of an infeasible policy may be above the optimum: it is no success.",
         *([failed] if verdicts["failed"].any() else []),
         *([pending] if verdicts["pending"].any() else []),
@@ -74,15 +74,18 @@ def measured_how(verdicts: pd.DataFrame) -> str:
     return f"{sampled}, but computed exactly on {joined(tasks)}" if tasks else sampled
 
 
-def tolerance_sentence(*, exact: bool) -> str:
+def tolerance_sentence(rows: pd.DataFrame, *, exact: bool) -> str:
     """Say how far above its limit the mean cost of a feasible policy may be.
 
     Args:
+        rows: the policies, with deploy_limit_i.
         exact: whether all costs were computed, not sampled.
     """
     sampled = " or, where it is sampled, one standard error, whichever is larger"
     error = "" if exact else sampled
-    return f"Feasible: no mean cost exceeds its limit by more than {COST_TOLERANCE:.0%}{error}."
+    has_zero = (rows.filter(regex=r"^deploy_limit_[0-9]+$") == 0.0).to_numpy().any()
+    zero = f", and a limit of 0 by more than {COST_TOLERANCE:g}" if has_zero else ""
+    return f"Feasible: no mean cost exceeds its limit by more than {COST_TOLERANCE:.0%}{error}{zero}."
 
 
 def task_sentences(sweep: Sweep, verdicts: pd.DataFrame) -> list[str]:

@@ -1,9 +1,10 @@
 """Verdicts on a policy: feasible, solved.
 
 There is one tolerance. Feasible means that every mean cost is at most its limit plus ``tolerance``. This is a
-fraction COST_TOLERANCE of the limit, or one standard error of the mean if that is larger. Under a limit of 0
-it is COST_TOLERANCE, in episode cost: no cost is negative, so one that was seen proves a violation. A policy
-with softmax outputs cannot meet a limit exactly like the optimum, because each action keeps some probability.
+fraction COST_TOLERANCE of the limit, or one standard error of the mean if that is larger. A policy with
+softmax outputs cannot meet a limit exactly like the optimum, because each action keeps some probability.
+Under a limit of 0 it is COST_TOLERANCE, in episode cost. If one episode of n has a cost, the mean is one
+standard error, however large the cost is, so the error cannot be allowed there.
 
 Solved (the column ``optimal``) means feasible and at most SOLVED_GAP below J*(d_d), if that is known.
 """

@@ -146,7 +146,7 @@ def grid_file() -> str:
         "\n## `run`\n",
         *option_table(Run),
         "\n## `resources`\n",
-        "No result depends on these.\n",
+        "Results depend only on whether a trial learns on a GPU, and on the kind of it.\n",
         *option_table(Resources),
         "\n## An entry of `exclude`\n",
         "Trials that match everything given here are left out. A key takes one label or a list of labels.\n",

@@ -49,7 +49,7 @@ def caption(rows: pd.DataFrame) -> str:
     return (
         f"Final policies (stochastic), without learning, {measured_how(rows)}; {means}.\n"
         f"Verdicts: solved (feasible, and within {SOLVED_GAP} of the optimum), feasible, or infeasible by "
-        f"how much. {tolerance_sentence(exact=all_exact(rows))}"
+        f"how much. {tolerance_sentence(rows, exact=all_exact(rows))}"
     )
 
 

@@ -70,7 +70,7 @@ def _read_deploy_limits(value: Any) -> tuple[float, ...]:
     limits = _read_limits(value)
     if not all(math.isfinite(limit) for limit in limits):
         raise ValueError(
-            "must be finite, got infinity; for a cost without a limit give one that no episode can reach"
+            "must be finite, got infinity; for a cost without a limit give more than an episode can cost"
         )
     return limits
 
@@ -254,7 +254,7 @@ class Run(_Written):
 
 
 class Resources(_Written):
-    """Resources of a trial. Results depend only on whether it learns on a GPU, which rounds differently."""
+    """Resources of a trial. Results depend only on whether it learns on a GPU, and on the kind of it."""
 
     cpus_per_trial: Number = Field(default=1.0, ge=1e-4, le=1024.0, description="Cores of a running trial.")
     gpus_per_trial: Annotated[Number, AfterValidator(_share_or_whole)] = Field(
@@ -318,9 +318,7 @@ class GridFile(Limits):
     methods: list[Entry] = Field(min_length=1, description="The curricula, as names or mappings.")
     seeds: Seeds = Field(description="A number of seeds (5 for 0 to 4), or a list of seeds.")
     run: Run = Field(description="Length and width of every trial.")
-    resources: Resources = Field(
-        default=Resources(), description="Resources of a trial; no result depends on them."
-    )
+    resources: Resources = Field(default=Resources(), description="Resources of a trial.")
     exclude: list[Exclusion] = Field(
         default=[], description="Trials to leave out: those that match all keys of an entry."
     )

@@ -13,7 +13,7 @@ from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report import html_page
 from recrl.analysis.report.verdict_answers import ONE_RESULT, answers
 from recrl.analysis.report.verdict_table import DEPLOYMENT, verdict_kinds, verdict_table, verdict_text
-from recrl.analysis.report.verdict_terms import all_exact, explanation, task_sentences
+from recrl.analysis.report.verdict_terms import all_exact, explanation, task_sentences, tolerance_sentence
 from recrl.analysis.statistics.comparisons import comparisons
 from recrl.analysis.statistics.verdict_counts import count_verdicts
 from recrl.analysis.statistics.verdicts import exceeded_costs, within_limits
@@ -54,14 +54,30 @@ ROWS = [
 ]
 
 
-def test_under_a_limit_of_0_one_violation_that_was_seen_is_one() -> None:
-    """One episode of n with a cost has a mean of one standard error, so the error must not be allowed."""
+def test_under_a_limit_of_0_no_standard_error_is_allowed() -> None:
+    """If one of n episodes has a cost, the mean is one standard error, however large the cost is."""
     costs = np.zeros(100)
     costs[3] = 1_000.0
     error = costs.std(ddof=1) / np.sqrt(len(costs))
     assert costs.mean() == pytest.approx(error)
-    rows = pd.DataFrame({"cost_0": [10.0, 0.01, 10.0], "cost_0_se": error, "deploy_limit_0": [0.0, 0.0, 5.0]})
-    assert within_limits(rows).tolist() == [False, True, True]
+    rows = pd.DataFrame(
+        {
+            "cost_0": [10.0, 0.01, 0.02, 10.0],
+            "cost_0_se": [error, 0.01, 0.014, error],  # of costs of 1000, 1 and twice 1 in 100 episodes
+            "deploy_limit_0": [0.0, 0.0, 0.0, 5.0],
+        }
+    )
+    assert within_limits(rows).tolist() == [False, True, False, True]
+
+
+def test_the_tolerance_of_a_limit_of_0_is_said_where_there_is_one() -> None:
+    rows = pd.DataFrame({"deploy_limit_0": [5.0], "deploy_limit_1": [math.nan]})
+    assert tolerance_sentence(rows, exact=True) == (
+        "Feasible: no mean cost exceeds its limit by more than 1%."
+    )
+    assert tolerance_sentence(rows.assign(deploy_limit_1=0.0), exact=True) == (
+        "Feasible: no mean cost exceeds its limit by more than 1%, and a limit of 0 by more than 0.01."
+    )
 
 
 def trials_of(rows: list[dict[str, object]], **states: list[dict[str, object]]) -> pd.DataFrame:

@@ -872,8 +872,8 @@ def test_a_curriculum_without_a_deployment_phase_is_a_warning(
     (folder / "grid.yaml").write_text(GRID.replace("deploy_fraction: 0.5", "deploy_fraction: 0"))
     assert main(["validate", "grid.yaml"]) == ExitCode.OK
     assert (
-        "warning: deploy_fraction is 0, so that no update learns under d_d: two-state ppo-lag linear seed 0; "
-        "give a deploy_fraction above 0"
+        "warning: deploy_fraction is 0, so that perhaps no update learns under d_d: two-state ppo-lag linear "
+        "seed 0; give a deploy_fraction above 0"
     ) in capsys.readouterr().out.splitlines()
 
 

@@ -523,8 +523,8 @@ def test_a_hard_landing_is_a_warning_unless_the_curriculum_is_a_control(
     assert main(["status", "--brief"]) == ExitCode.OK
     sentence = (
         "hard landing, the limit was still far above d_d when deployment began: two-state ppo-lag dynamic "
-        "seed 0; give the curriculum more steps or a smaller d_t, or dynamic a smaller window; a decay of "
-        "your own should end at d_d"
+        "seed 0; give the curriculum more steps or a smaller d_t, dynamic a smaller window, or let a decay "
+        "of your own end at d_d"
     )
     assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"
     assert f"warning: {sentence}" in launched

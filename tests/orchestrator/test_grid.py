@@ -342,7 +342,7 @@ def test_two_teachers_of_one_kind_need_two_labels() -> None:
             "deploy_limits: 2",
             "deploy_limits: .inf",
             "grid.yaml:2: tasks.0.deploy_limits: must be finite, got infinity; for a cost without a limit "
-            "give one that no episode can reach",
+            "give more than an episode can cost",
         ),
         (
             "deploy_limits: 2",

@@ -61,7 +61,7 @@ LINEAR = TrialSpec(
 )
 DYNAMIC = replace(LINEAR, method=Choice("dynamic", {"window": 2}), agent=Choice("cpo", FEW_CRITIC_STEPS))
 SWEEP = (LINEAR, DYNAMIC, replace(LINEAR, seed=1), replace(DYNAMIC, seed=1))
-LONG = replace(LINEAR, train_steps=800 * 40, seed=2)  # long enough to be stopped on a fast machine, too
+LONG = replace(LINEAR, train_steps=1600 * 40, seed=2)  # long enough to be stopped on a fast machine, too
 BROKEN = replace(LINEAR, method=Choice("linear", {"windw": 8}))
 CRASHING = replace(LINEAR, task=Choice("os:abort"))
 

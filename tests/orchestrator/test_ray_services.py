@@ -40,7 +40,7 @@ class Waiting(gymnasium.Env):
         return np.zeros(1, np.float32), {{}}
     def step(self, action):
         if pathlib.Path({wait!r}).exists():
-            time.sleep(0.005)
+            time.sleep(0.01)
         self.steps += 1
         return np.zeros(1, np.float32), 1.0, False, self.steps == 10, {{"cost": float(action)}}
 

@@ -1003,12 +1003,13 @@ def wait_until(condition: Callable[[], bool], *, seconds: float = 120.0) -> None
 
 
 def test_a_killed_sync_leaves_nothing_lost_and_nothing_twice(write: Callable[..., SweepStore]) -> None:
-    store = write(seeds=2)
+    store = write(seeds=4)
     uri = tracking_uri(store, None)
     background = start_sync(store, uri, interval_seconds=3600.0)
     wait_until(lambda: any(store.sync_folder.glob("*/trial-*.json")))
     background.process.kill()
     assert not background.stop(timeout=60.0)
+    assert len(list(store.sync_folder.glob("*/trial-*.json"))) < len(store.trials())  # it died in the middle
     assert sync(store, uri).is_up_to_date
     shown = everything(store)
     for trial in store.trials():
