@@ -114,22 +114,23 @@ def code_warnings(ran: Sequence[tuple[TrialStatus, CodeComparison]]) -> list[str
     Args:
         ran: status and comparison of each trial.
     """
-    changed = [status for status, code in ran if code.differs]
-    complete = changed.count(TrialStatus.COMPLETE)
+    changed = [(status, code) for status, code in ran if code.differs]
+    complete = sum(status is TrialStatus.COMPLETE for status, _ in changed)
     sentences = (
-        other_code_sentence(complete, len(changed) - complete),
+        other_code_sentence(complete, len(changed) - complete, (code.changed for _, code in changed)),
         missing_modules_sentence(code.missing for _, code in ran),
         other_versions_sentence(code.versions for _, code in ran),
     )
     return [*filter(None, sentences)]
 
 
-def other_code_sentence(complete: int, begun: int) -> str:
+def other_code_sentence(complete: int, begun: int, changed: Iterable[Collection[str]]) -> str:
     """Describe trials that ran other code; empty for none.
 
     Args:
         complete: complete ones.
         begun: incomplete ones.
+        changed: ``CodeComparison.changed`` of each.
     """
     parts = []
     if complete:
@@ -140,9 +141,10 @@ def other_code_sentence(complete: int, begun: int) -> str:
         return ""
     comes = "comes" if complete + begun == 1 else "come"
     them = "it" if complete + begun == 1 else "them"
+    names = ", ".join(sorted(set().union(*changed)))
     return (
-        f"{' and '.join(parts)} {comes} from other code than is installed now; launch --rerun-changed runs "
-        f"{them} again"
+        f"{' and '.join(parts)} {comes} from other code than is installed now (changed: {names}); "
+        f"launch --rerun-changed runs {them} again"
     )
 
 

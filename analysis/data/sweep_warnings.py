@@ -35,9 +35,9 @@ def doubts(sweep: Sweep) -> list[str]:
     """Return sentences on code, libraries and devices that differ, and on ineffective curricula."""
     installed = InstalledCode()
     codes = [compare(attempts(it), it.spec, installed) for it in sweep.facts]
-    changed = [it for it, code in zip(sweep.facts, codes, strict=True) if code.differs]
-    complete = sum(it.status is TrialStatus.COMPLETE for it in changed)
-    other = other_code_sentence(complete, len(changed) - complete)
+    changed = [(it, code.changed) for it, code in zip(sweep.facts, codes, strict=True) if code.differs]
+    complete = sum(it.status is TrialStatus.COMPLETE for it, _ in changed)
+    other = other_code_sentence(complete, len(changed) - complete, (names for _, names in changed))
     if other and sweep.folder is None:
         other += ", in a sweep's own folder"
     missing = missing_modules_sentence(code.missing for code in codes)

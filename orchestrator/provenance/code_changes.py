@@ -101,15 +101,20 @@ class CodeComparison:
     """The code that a trial ran, compared with the code that is installed now.
 
     Attributes:
-        differs: whether an attempt ran other code; False if unknown.
+        changed: the packages and modules of which an attempt ran other code; empty if that is unknown.
         missing: the top-level packages and modules that it ran and that are not found now. So it is unknown
             whether their code differs. Empty if other code differs.
         versions: of libraries in an attempt, where they are others now, such as "torch 2.12.0, now 2.13.0".
     """
 
-    differs: bool = False
+    changed: frozenset[str] = frozenset()
     missing: frozenset[str] = frozenset()
     versions: frozenset[str] = frozenset()
+
+    @property
+    def differs(self) -> bool:
+        """Whether an attempt ran other code; False if unknown."""
+        return bool(self.changed)
 
 
 def compare(
@@ -127,8 +132,8 @@ def compare(
     installed = installed or InstalledCode()
     now = installed.of(spec)
     versions = _other_versions(attempts, installed.libraries)
-    if any(name in now and digest != now[name] for name, digest in ran):
-        return CodeComparison(differs=True, versions=versions)
+    if changed := frozenset(name for name, digest in ran if name in now and digest != now[name]):
+        return CodeComparison(changed, versions=versions)
     return CodeComparison(missing=frozenset(name for name, _ in ran if name not in now), versions=versions)
 
 

@@ -74,8 +74,8 @@ train_limits: 9
 run: {total_steps: 80, deploy_fraction: 0.5, num_envs: 2, rollout_steps: 10, evaluation_episodes: 2}
 """
 SENTENCE = (
-    "warning: 1 complete trial comes from other code than is installed now; launch --rerun-changed runs it "
-    "again"
+    "warning: 1 complete trial comes from other code than is installed now (changed: my_scaled_task); launch "
+    "--rerun-changed runs it again"
 )
 INSTALLED = "These evaluations use the code and the libraries that are installed now."
 
@@ -463,13 +463,15 @@ def test_other_versions_of_libraries_are_said_where_a_launch_would_mix_them(
 
 def test_the_sentences_count() -> None:
     assert other_versions_sentence([(), ()]) == ""
-    assert other_code_sentence(0, 0) == ""
-    assert other_code_sentence(12, 0) == (
-        "12 complete trials come from other code than is installed now; launch --rerun-changed runs them "
-        "again"
+    assert other_code_sentence(0, 0, []) == ""
+    assert other_code_sentence(12, 0, [{"recrl"}] * 11 + [{"mynav", "recrl"}]) == (
+        "12 complete trials come from other code than is installed now (changed: mynav, recrl); launch "
+        "--rerun-changed runs them again"
     )
-    assert other_code_sentence(1, 2).startswith("1 complete trial and 2 begun ones come from other code than")
-    assert other_code_sentence(0, 1).startswith("1 begun trial comes from other code than")
+    assert other_code_sentence(1, 2, [{"recrl"}]).startswith(
+        "1 complete trial and 2 begun ones come from other code than"
+    )
+    assert other_code_sentence(0, 1, [{"recrl"}]).startswith("1 begun trial comes from other code than")
     assert missing_modules_sentence([(), ()]) == ""
     assert missing_modules_sentence([{"b", "c"}, (), {"a", "b"}]).startswith(
         "the code of 2 trials was not checked for changes, because the module a and 2 others were not found; "
