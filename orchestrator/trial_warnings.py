@@ -12,7 +12,6 @@ from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.teachers.registry import is_known_control
 
 NAMED = 5  # trials in a sentence, at most
-IGNORING_TRAIN_LIMITS = ("none", "unconstrained")  # curricula
 
 
 def landed_hard(spec: TrialSpec, events: Iterable[str]) -> bool:
@@ -42,8 +41,8 @@ def hard_landing_sentence(titles: Sequence[str]) -> str:
     )
 
 
-def no_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
-    """Return the warning about trials without an update in the deployment phase; empty for none."""
+def short_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
+    """Return the warning about trials whose deployment phase is shorter than an update; empty for none."""
     what = "the deployment phase is shorter than an update, so that no update learns under d_d"
     short = [spec for spec in specs if spec.lacks_deployment]
     if not short:
@@ -54,27 +53,25 @@ def no_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
     return _warning(what, [spec.title for spec in short], remedy)
 
 
-def absent_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
+def no_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
     """Return the warning about curricula without a deployment phase; empty for none."""
     what = "deploy_fraction is 0, so that perhaps no update learns under d_d"
-    absent = [spec.title for spec in specs if not spec.deploy_steps and _is_relaxed(spec)]
-    return _warning(what, absent, "give a deploy_fraction above 0")
-
-
-def _is_relaxed(spec: TrialSpec) -> bool:
-    """Whether the limits may differ from d_d in the training phase."""
-    return spec.method.name != "none" and spec.train_limits != spec.deploy_limits
+    lacking = [spec.title for spec in specs if not spec.deploy_steps and _is_relaxed(spec)]
+    return _warning(what, lacking, "give a deploy_fraction above 0")
 
 
 def unrelaxed_sentence(specs: Sequence[TrialSpec]) -> str:
     """Return the warning about curricula whose d_t is d_d; empty for none."""
     what = "train_limits equal deploy_limits, so that the limits are d_d from the start"
-    unrelaxed = [
-        spec.title
-        for spec in specs
-        if spec.train_limits == spec.deploy_limits and spec.method.name not in IGNORING_TRAIN_LIMITS
-    ]
+    unrelaxed = [spec.title for spec in specs if spec.method.name != "none" and not _is_relaxed(spec)]
     return _warning(what, unrelaxed, "give larger train_limits, or auto")
+
+
+def _is_relaxed(spec: TrialSpec) -> bool:
+    """Whether the limits may differ from d_d in the training phase."""
+    if spec.method.name == "none":
+        return False
+    return spec.method.name == "unconstrained" or spec.train_limits != spec.deploy_limits
 
 
 def short_training_sentence(specs: Sequence[TrialSpec], horizons: Mapping[str, int | None]) -> str:
@@ -114,24 +111,23 @@ def code_warnings(ran: Sequence[tuple[TrialStatus, CodeComparison]]) -> list[str
     Args:
         ran: status and comparison of each trial.
     """
-    changed = [(status, code) for status, code in ran if code.differs]
-    complete = sum(status is TrialStatus.COMPLETE for status, _ in changed)
     sentences = (
-        other_code_sentence(complete, len(changed) - complete, (code.changed for _, code in changed)),
+        other_code_sentence(ran),
         missing_modules_sentence(code.missing for _, code in ran),
         other_versions_sentence(code.versions for _, code in ran),
     )
     return [*filter(None, sentences)]
 
 
-def other_code_sentence(complete: int, begun: int, changed: Iterable[Collection[str]]) -> str:
+def other_code_sentence(ran: Iterable[tuple[TrialStatus, CodeComparison]]) -> str:
     """Describe trials that ran other code; empty for none.
 
     Args:
-        complete: complete ones.
-        begun: incomplete ones.
-        changed: ``CodeComparison.changed`` of each.
+        ran: status and comparison of each trial.
     """
+    changed = [(status, code.changed) for status, code in ran if code.differs]
+    complete = sum(status is TrialStatus.COMPLETE for status, _ in changed)
+    begun = len(changed) - complete
     parts = []
     if complete:
         parts.append(counted(complete, "complete trial"))
@@ -139,9 +135,8 @@ def other_code_sentence(complete: int, begun: int, changed: Iterable[Collection[
         parts.append(counted(begun, "begun one" if complete else "begun trial"))
     if not parts:
         return ""
-    comes = "comes" if complete + begun == 1 else "come"
-    them = "it" if complete + begun == 1 else "them"
-    names = ", ".join(sorted(set().union(*changed)))
+    comes, them = ("comes", "it") if len(changed) == 1 else ("come", "them")
+    names = ", ".join(sorted(set().union(*(names for _, names in changed))))
     return (
         f"{' and '.join(parts)} {comes} from other code than is installed now (changed: {names}); "
         f"launch --rerun-changed runs {them} again"

@@ -34,13 +34,11 @@ def damages(sweep: Sweep) -> list[str]:
 def doubts(sweep: Sweep) -> list[str]:
     """Return sentences on code, libraries and devices that differ, and on ineffective curricula."""
     installed = InstalledCode()
-    codes = [compare(attempts(it), it.spec, installed) for it in sweep.facts]
-    changed = [(it, code.changed) for it, code in zip(sweep.facts, codes, strict=True) if code.differs]
-    complete = sum(it.status is TrialStatus.COMPLETE for it, _ in changed)
-    other = other_code_sentence(complete, len(changed) - complete, (names for _, names in changed))
+    ran = [(it.status, compare(attempts(it), it.spec, installed)) for it in sweep.facts]
+    other = other_code_sentence(ran)
     if other and sweep.folder is None:
         other += ", in a sweep's own folder"
-    missing = missing_modules_sentence(code.missing for code in codes)
+    missing = missing_modules_sentence(code.missing for _, code in ran)
     mixed = (mixed_code_sentence(sweep), mixed_versions_sentence(sweep), mixed_devices_sentence(sweep))
     return [*filter(None, (other, missing, *mixed)), *curriculum_warnings(sweep)]
 

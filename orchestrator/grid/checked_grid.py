@@ -10,8 +10,8 @@ from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.grid.file_models import Exclusion, Resources, Run
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.orchestrator.trial_warnings import (
-    absent_deployment_sentence,
     no_deployment_sentence,
+    short_deployment_sentence,
     short_training_sentence,
     unknown_horizon_sentence,
     unrelaxed_sentence,
@@ -79,8 +79,8 @@ class GridSpec:
         sentences = (
             unknown_horizon_sentence([task for task, horizon in horizons.items() if horizon is None]),
             short_training_sentence(specs, horizons),
+            short_deployment_sentence(specs),
             no_deployment_sentence(specs),
-            absent_deployment_sentence(specs),
             unrelaxed_sentence(specs),
         )
         return [*filter(None, sentences)]

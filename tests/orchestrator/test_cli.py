@@ -877,6 +877,21 @@ def test_a_curriculum_without_a_deployment_phase_is_a_warning(
     ) in capsys.readouterr().out.splitlines()
 
 
+def test_a_control_without_limits_needs_a_deployment_phase_whatever_train_limits_are(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = GRID.replace("0.5", "0").replace("linear", "linear, unconstrained")
+    (folder / "grid.yaml").write_text(text.replace("deploy_limits: 2", "deploy_limits: 2, train_limits: 2"))
+    assert main(["validate", "grid.yaml"]) == ExitCode.OK
+    warnings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: ")]
+    assert warnings == [
+        "warning: deploy_fraction is 0, so that perhaps no update learns under d_d: "
+        "two-state ppo-lag unconstrained seed 0; give a deploy_fraction above 0",
+        "warning: train_limits equal deploy_limits, so that the limits are d_d from the start: "
+        "two-state ppo-lag linear seed 0; give larger train_limits, or auto",
+    ]
+
+
 def test_a_training_shorter_than_an_episode_is_a_warning(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -463,15 +463,19 @@ def test_other_versions_of_libraries_are_said_where_a_launch_would_mix_them(
 
 def test_the_sentences_count() -> None:
     assert other_versions_sentence([(), ()]) == ""
-    assert other_code_sentence(0, 0, []) == ""
-    assert other_code_sentence(12, 0, [{"recrl"}] * 11 + [{"mynav", "recrl"}]) == (
+    unchanged = TrialStatus.COMPLETE, CodeComparison()
+    complete = TrialStatus.COMPLETE, CodeComparison(changed=frozenset({"recrl"}))
+    begun = TrialStatus.WAITING, CodeComparison(changed=frozenset({"mynav", "recrl"}))
+    own = TrialStatus.COMPLETE, begun[1]
+    assert other_code_sentence([unchanged]) == ""
+    assert other_code_sentence([unchanged, *[complete] * 11, own]) == (
         "12 complete trials come from other code than is installed now (changed: mynav, recrl); launch "
         "--rerun-changed runs them again"
     )
-    assert other_code_sentence(1, 2, [{"recrl"}]).startswith(
+    assert other_code_sentence([complete, begun, begun]).startswith(
         "1 complete trial and 2 begun ones come from other code than"
     )
-    assert other_code_sentence(0, 1, [{"recrl"}]).startswith("1 begun trial comes from other code than")
+    assert other_code_sentence([begun, unchanged]).startswith("1 begun trial comes from other code than")
     assert missing_modules_sentence([(), ()]) == ""
     assert missing_modules_sentence([{"b", "c"}, (), {"a", "b"}]).startswith(
         "the code of 2 trials was not checked for changes, because the module a and 2 others were not found; "
