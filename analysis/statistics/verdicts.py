@@ -3,8 +3,8 @@
 There is one tolerance. Feasible means that every mean cost is at most its limit plus ``tolerance``. This is a
 fraction COST_TOLERANCE of the limit, or one standard error of the mean if that is larger. A policy with
 softmax outputs cannot meet a limit exactly like the optimum, because each action keeps some probability.
-Under a limit of 0 it is COST_TOLERANCE, in episode cost. If one episode of n has a cost, the mean is one
-standard error, however large the cost is, so the error cannot be allowed there.
+Under a limit of 0 it is COST_TOLERANCE, in episode cost. If only one of many episodes has a cost, the mean
+equals its standard error, however large that cost is. So one standard error would allow any such cost.
 
 Solved (the column ``optimal``) means feasible and at most SOLVED_GAP below J*(d_d), if that is known.
 """
