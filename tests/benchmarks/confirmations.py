@@ -3,7 +3,7 @@
     python -m tests.benchmarks.confirmations results/safety-gym/button-confirm.csv \
         --earlier results/safety-gym/curricula-today.csv results/safety-gym/table.csv
 
-The tables are those of ``final_policies.py``; the task of the first one says which rule it is. Printed are
+The tables are those of ``final_policies.py``; the one task of the first that has a rule says which. Printed are
 the conditions of the rule, for ppo-lag's final stochastic policies. Then come the differences of linear from
 none in return and cost, with 95% intervals, paired (Student) and as two groups (Welch): of these seeds, of
 these with the first earlier table if there is one, and of all.
@@ -101,7 +101,7 @@ def main() -> None:
     parser.add_argument("--earlier", type=Path, nargs="+", default=[])
     given = parser.parse_args()
     fresh = pd.read_csv(given.fresh)
-    [task] = fresh["task"].unique()
+    [task] = RULES.keys() & set(fresh["task"])
     everything = pd.concat([fresh, *map(pd.read_csv, given.earlier)], keys=range(1 + len(given.earlier)))
     of_question = everything[(everything["task"] == task) & (everything["agent"] == AGENT)]
     of_question = of_question[of_question["method"].isin(METHODS)]
