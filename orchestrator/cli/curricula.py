@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 from rich.console import Console
@@ -16,10 +18,16 @@ from recrl.orchestrator.cli.sweeps import open_store
 from recrl.orchestrator.errors import TRUST_HINT, USERS_ERRORS, RecrlError, StorageError, described
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.only_selection import parse_only, select
 from recrl.orchestrator.spec import Choice, TrialStatus
 from recrl.orchestrator.validation_sentences import NotJsonError, require_json, sentences
 from recrl.teachers.registry import find_teacher, teacher_config
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from recrl.analysis.figures.curriculum_replay import Replayed
 
 
 def run_bound(request: BoundRequest, console: Console) -> ExitCode:
@@ -68,33 +76,22 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
     """Print the limits that another curriculum would have set on the recorded episodes."""
     import pandas as pd  # noqa: PLC0415  (commands that do not need it are quick to start)
 
-    from recrl.analysis.figures import styles  # noqa: PLC0415
-    from recrl.analysis.figures.curriculum_replay import Replayed, replayed_limits  # noqa: PLC0415
+    from recrl.analysis.figures.curriculum_replay import Replayed  # noqa: PLC0415
     from recrl.analysis.report.table_formats import write_csv  # noqa: PLC0415
     from recrl.analysis.report.text_tables import replay_summary  # noqa: PLC0415
-    from recrl.analysis.statistics.curriculum_replay import replay  # noqa: PLC0415
 
     store = open_store(request)
     specs = select(store.specs(), parse_only(request.only))
     method = _teacher(store, request)
     folder, runs, summaries = store.folder / "replays", [], []
     damaged = []
-    for trial in (store.trial(spec) for spec in specs):
-        record = trial.record()
-        if record.status is TrialStatus.DAMAGED:
-            damaged.append(f"{trial.title}: {record.error}")
-        elif record.committed.get(trial.updates_path.name, 0):
-            try:
-                rows = replay(trial, method)
-            except StorageError as error:
-                damaged.append(str(error))
-                continue
-            except RecrlError:
-                raise
-            except USERS_ERRORS as error:
-                raise RecrlError(
-                    f"{method.label}: cannot be replayed on {trial.title}: {described(error)}"
-                ) from error
+    for trial in map(store.trial, specs):
+        try:
+            rows = _replay(trial, method)
+        except StorageError as error:
+            damaged.append(str(error))
+            continue
+        if rows is not None:
             write_csv(rows, folder / f"{trial.folder.name}__{method.file_name}.csv")
             runs.append(Replayed(trial.spec, rows))
             summaries.append(replay_summary(trial, rows))
@@ -110,13 +107,46 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
         "mean limit, replayed: means of the finite limits; reaches d_d: the share of the training phase "
         "after which the limit is the deployment limit.",
     )
+    for file in _draw(runs, method, folder):
+        say(console, f"Figure        {short(file)}")
+    say(console, f"Every update  {short(folder)}")
+    return ExitCode.OK
+
+
+def _replay(trial: TrialStore, method: Choice) -> pd.DataFrame | None:
+    """Return the limits on a trial's recorded episodes; None if it has no saved policy update.
+
+    Raises:
+        StorageError: the trial is damaged.
+        RecrlError: the curriculum cannot be used with it, or its code raises an error.
+    """
+    from recrl.analysis.statistics.curriculum_replay import replay  # noqa: PLC0415
+
+    record = trial.record()
+    if record.status is TrialStatus.DAMAGED:
+        raise StorageError(f"{trial.title}: {record.error}")
+    if not record.committed.get(trial.updates_path.name, 0):
+        return None
+    try:
+        return replay(trial, method)
+    except RecrlError:
+        raise
+    except USERS_ERRORS as error:
+        raise RecrlError(
+            f"{method.label}: cannot be replayed on {trial.title}: {described(error)}"
+        ) from error
+
+
+def _draw(runs: Sequence[Replayed], method: Choice, folder: Path) -> Iterator[Path]:
+    """Draw a figure a cost, and yield the files."""
+    from recrl.analysis.figures import styles  # noqa: PLC0415
+    from recrl.analysis.figures.curriculum_replay import replayed_limits  # noqa: PLC0415
+
     for i in range(max(len(run.spec.deploy_limits) for run in runs)):
         with_cost = [run for run in runs if len(run.spec.deploy_limits) > i]
         figure = replayed_limits(with_cost, method.label, cost=i)
-        _, picture = styles.save(figure, folder, f"{method.file_name}_cost-{i}" if i else method.file_name)
-        say(console, f"Figure        {short(picture)}")
-    say(console, f"Every update  {short(folder)}")
-    return ExitCode.OK
+        _, file = styles.save(figure, folder, f"{method.file_name}_cost-{i}" if i else method.file_name)
+        yield file
 
 
 def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:

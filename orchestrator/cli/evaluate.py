@@ -24,7 +24,7 @@ from recrl.orchestrator.trial_warnings import code_warnings
 
 if TYPE_CHECKING:
     from recrl.agents.evaluation import FrozenPolicy
-    from recrl.orchestrator.trial.saved_policy import SavedTrial
+    from recrl.orchestrator.trial.saved_policy import SavedEvaluation, SavedTrial
     from recrl.orchestrator.trial.videos import VideoFormat
 
 DEFAULT_EPISODES = 100  # episodes, for trials without an evaluation of their own
@@ -32,55 +32,65 @@ DEFAULT_EPISODES = 100  # episodes, for trials without an evaluation of their ow
 
 def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
     """Evaluate the policies of trials for whole episodes, and film them on request."""
-    import pandas as pd  # noqa: PLC0415
-
     from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415  (imports gymnasium)
-    from recrl.orchestrator.trial.saved_policy import SavedTrial, summary  # noqa: PLC0415  (imports torch)
     from recrl.orchestrator.trial.videos import VideoFormat  # noqa: PLC0415
 
     store = open_store(request, checkpoints=True)
     chosen, orphans = _chosen(store, request)
     policies = tuple(FrozenPolicy) if request.policy == "both" else (FrozenPolicy(request.policy),)
-    loaded, left_out = [], []
-    for trial in chosen:
-        try:
-            trial.require_whole()
-            loaded.append(SavedTrial.load(trial))
-        except RecrlError as error:
-            left_out.append(error)
-    if not loaded:
-        raise left_out[0]
-    rows, written, evaluated = [], [], []
-    for saved in loaded:
-        num_episodes = request.episodes or saved.spec.evaluation_episodes or DEFAULT_EPISODES
-        try:
-            episodes, path = saved.evaluate(policies, num_episodes=num_episodes, seed=request.seed)
-        except RecrlError as error:
-            left_out.append(error)
-            continue
-        rows += summary(episodes, saved)
-        written.append(path)
-        evaluated.append(saved)
+    evaluated, left_out = _evaluate(chosen, policies, request)
     if not evaluated:
         raise left_out[0]
-    show(pd.DataFrame(rows), console)
-    say(
-        console,
-        "Means and standard errors. d_d: deployment limits; within: episodes in which no cost exceeded them.",
-    )
-    for path in written:
-        say(console, f"Episodes   {short(path)}")
+    _show(evaluated, console)
     for reason in left_out:
         say(console, f"left out   {reason}")
     if orphans:
         say(console, f"left out   {_no_longer(orphans)}")
-    _warn_of_other_code(evaluated, console)
+    trials = [saved for saved, _ in evaluated]
+    _warn_of_other_code(trials, console)
     missing_videos = 0
     if request.video:
         kind = VideoFormat(request.video)
-        missing_videos = sum(_film(saved, policies, kind, request.seed, console) for saved in evaluated)
+        missing_videos = sum(_film(saved, policies, kind, request.seed, console) for saved in trials)
     _tell_mlflow(store, request, console)
     return ExitCode.TRIALS_FAILED if left_out or missing_videos else ExitCode.OK
+
+
+def _evaluate(
+    chosen: Sequence[TrialStore], policies: Sequence[FrozenPolicy], request: EvaluateRequest
+) -> tuple[list[tuple[SavedTrial, SavedEvaluation]], list[RecrlError]]:
+    """Return the trials that can be evaluated with their evaluations, and why others cannot."""
+    from recrl.orchestrator.trial.saved_policy import SavedTrial  # noqa: PLC0415  (imports torch)
+
+    evaluated, left_out = [], []
+    for trial in chosen:
+        try:
+            trial.require_whole()
+            saved = SavedTrial.load(trial)
+            num_episodes = request.episodes or saved.spec.evaluation_episodes or DEFAULT_EPISODES
+            evaluation = saved.evaluate(policies, num_episodes=num_episodes, seed=request.seed)
+        except RecrlError as error:
+            left_out.append(error)
+        else:
+            evaluated.append((saved, evaluation))
+    return evaluated, left_out
+
+
+def _show(evaluated: Sequence[tuple[SavedTrial, SavedEvaluation]], console: Console) -> None:
+    """Print a table of the evaluations, and their files."""
+    import pandas as pd  # noqa: PLC0415
+
+    from recrl.orchestrator.trial.saved_policy import summary  # noqa: PLC0415  (imports torch)
+
+    show(pd.DataFrame([row for saved, it in evaluated for row in summary(it.rows, saved)]), console)
+    say(
+        console,
+        "Means and standard errors. d_d: deployment limits; within: episodes in which no cost exceeded them.",
+    )
+    for _, evaluation in evaluated:
+        say(console, f"Episodes   {short(evaluation.path)}")
+        if evaluation.earlier:
+            say(console, f"Replaced   the earlier evaluation with this seed, now {short(evaluation.earlier)}")
 
 
 def _warn_of_other_code(evaluated: Sequence[SavedTrial], console: Console) -> None:

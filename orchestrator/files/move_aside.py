@@ -8,16 +8,21 @@ import shutil
 from pathlib import Path
 
 
-def move_aside(path: Path, folder: Path, *, copy: bool = False) -> None:
-    """Move a file or folder to another folder, under a free name; do nothing if it does not exist."""
+def move_aside(path: Path, folder: Path, *, copy: bool = False) -> Path | None:
+    """Move a file or folder to another folder, under a free name.
+
+    Returns:
+        Where it is now; None if it does not exist.
+    """
     if not os.path.lexists(path):
-        return
+        return None
     folder.mkdir(parents=True, exist_ok=True)
     place = folder / f"{next_number(folder):03d}-{path.name.lstrip('.')}"
     if copy and path.is_file():
         shutil.copy2(path, place)
     else:
         path.rename(place)
+    return place
 
 
 def next_number(folder: Path, prefix: str = "") -> int:

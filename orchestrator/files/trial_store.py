@@ -48,9 +48,9 @@ class TrialStore(TrialReader):
         value = {"trial_id": self.trial_id, **record.to_json()}
         write_sealed(self.state_path, value, version=RECORD_FORMAT)
 
-    def move_aside(self, path: Path, *, copy: bool = False) -> None:
-        """Keep a file of the trial, or what is in its place, in ``aside/``; nothing if it is not there."""
-        move_aside(path, self.aside_folder, copy=copy)
+    def move_aside(self, path: Path, *, copy: bool = False) -> Path | None:
+        """Keep a file of the trial, or what is in its place, in ``aside/``; return where, or None."""
+        return move_aside(path, self.aside_folder, copy=copy)
 
     @contextmanager
     def writing(self) -> Iterator[None]:

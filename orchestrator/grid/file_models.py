@@ -245,7 +245,11 @@ class Run(_Written):
         "(ours).",
     )
     evaluation_episodes: Whole = Field(
-        default=100, ge=0, le=1_000_000, description="Episodes of each final evaluation (ours)."
+        default=100,
+        ge=0,
+        le=1_000_000,
+        description="Episodes of each final evaluation; with 0 only finite tasks have results of final "
+        "policies (ours).",
     )
     videos: Literal["none", "first-seed", "all"] = Field(
         default="none",

@@ -45,6 +45,21 @@ class NoCheckpointError(RecrlError):
 
 
 @dataclass(frozen=True, eq=False)
+class SavedEvaluation:
+    """An evaluation of a trial's policy.
+
+    Attributes:
+        rows: one an episode, as in ``evaluation.csv``.
+        path: the file with them.
+        earlier: where an earlier evaluation of the same update and seed is kept, if it differs; None if none.
+    """
+
+    rows: pd.DataFrame
+    path: Path
+    earlier: Path | None
+
+
+@dataclass(frozen=True, eq=False)
 class SavedTrial:
     """The policy of a trial's newest intact checkpoint.
 
@@ -94,10 +109,8 @@ class SavedTrial:
 
     def evaluate(
         self, policies: Sequence[FrozenPolicy], *, num_episodes: int, seed: int | None
-    ) -> tuple[pd.DataFrame, Path]:
-        """Evaluate the policy for whole episodes; return one row per episode, and the file with them.
-
-        An earlier evaluation of the same update and seed is kept in the trial's ``aside/``, if it differs.
+    ) -> SavedEvaluation:
+        """Evaluate the policy for whole episodes, and write a file with a row an episode.
 
         Args:
             policies: stochastic, deterministic or both; at least one.
@@ -108,10 +121,10 @@ class SavedTrial:
         path = self.store.evaluations_folder / f"{self._file_name(seed)}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
         text = rows_text(rows)
-        if path.exists() and path.read_bytes() != text:  # of another number of episodes, or other policies
-            self.store.move_aside(path)
+        differs = path.exists() and path.read_bytes() != text  # another number of episodes, or other policies
+        earlier = self.store.move_aside(path) if differs else None
         write_atomically(path, text)
-        return pd.DataFrame(rows), path
+        return SavedEvaluation(pd.DataFrame(rows), path, earlier)
 
     def film(self, policy: FrozenPolicy, video_format: VideoFormat, *, seed: int | None) -> Path:
         """Film one episode, with its return and costs below the frames.

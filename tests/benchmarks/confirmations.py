@@ -3,8 +3,8 @@
     python -m tests.benchmarks.confirmations results/safety-gym/button-confirm.csv \
         --earlier results/safety-gym/curricula-today.csv results/safety-gym/table.csv
 
-The tables are those of ``final_policies.py``; the one task of the first that has a rule says which. Printed are
-the conditions of the rule, for ppo-lag's final stochastic policies. Then come the differences of linear from
+The tables are those of ``final_policies.py``; one task of the first has a rule. Printed are the
+conditions of the rule, for ppo-lag's final stochastic policies. Then come the differences of linear from
 none in return and cost, with 95% intervals, paired (Student) and as two groups (Welch): of these seeds, of
 these with the first earlier table if there is one, and of all.
 """
@@ -105,7 +105,7 @@ def main() -> None:
     everything = pd.concat([fresh, *map(pd.read_csv, given.earlier)], keys=range(1 + len(given.earlier)))
     of_question = everything[(everything["task"] == task) & (everything["agent"] == AGENT)]
     of_question = of_question[of_question["method"].isin(METHODS)]
-    print("\n".join(verdict(of_question.loc[0], RULES[task])))
+    print("\n".join(verdict(of_question.loc[[0]], RULES[task])))
     for policy in ("stochastic", "deterministic"):
         for last in range(1 + len(given.earlier)):
             seeds = pairs(of_question.loc[:last], policy)

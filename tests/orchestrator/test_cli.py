@@ -747,7 +747,7 @@ SCRIPT = "import sys; sys.path.remove(''); from recrl.orchestrator.cli.main impo
 
 
 def test_modules_in_the_working_directory_are_found(folder: Path) -> None:
-    """The installed command does not look there by itself. A tutorial shows that Ray's workers find them, too."""
+    """The installed command does not look there by itself. A tutorial shows that Ray's workers do, too."""
     other = "name: gymnasium, deploy_limits: 2, options: {id: 'room_a:Room-v0'}}, {name: 'room_a:Room'"
     _own_room(folder, "room_a", "{'cost': 1.0}", other)
     done = _python(SCRIPT.format(["validate", "grid.yaml", "--trust"]), folder)
@@ -1003,7 +1003,12 @@ def test_evaluate_shows_what_it_could_evaluate(
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith("Episodes") for line in lines)
     assert "left out   no luck" in lines
+    assert not any(line.startswith("Replaced") for line in lines)
     assert main(["evaluate", "small", "--only", "method=linear"]) == ExitCode.WRONG_INPUT
+    assert main(["evaluate", "small", "--only", "method=none", "--episodes", "4"]) == ExitCode.OK
+    [replaced] = [it for it in capsys.readouterr().out.splitlines() if it.startswith("Replaced")]
+    assert replaced.startswith("Replaced   the earlier evaluation with this seed, now runs/small/trials/")
+    assert replaced.endswith("/aside/001-update-00000004__seed-own.csv")
     assert main(["evaluate", "small", "nobody", "--only", "seed=0"]) == ExitCode.WRONG_INPUT
     assert "no trials on disk begin with 'nobody'" in capsys.readouterr().err  # not that seed 0 is missing
 

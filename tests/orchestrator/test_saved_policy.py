@@ -93,32 +93,32 @@ def test_a_complete_trials_evaluation_comes_out_again(complete: TrialStore) -> N
     before = contents(complete)
     saved = SavedTrial.load(complete)
     assert (saved.update, saved.env_steps) == (5, 200)
-    rows, path = saved.evaluate(BOTH, num_episodes=6, seed=None)
+    evaluation = saved.evaluate(BOTH, num_episodes=6, seed=None)
+    path = evaluation.path
     assert path == complete.evaluations_folder / "update-00000005__seed-own.csv"
     assert path.read_bytes() == complete.evaluation_path.read_bytes()
-    pd.testing.assert_frame_equal(rows, complete.evaluation(), check_dtype=False)
+    pd.testing.assert_frame_equal(evaluation.rows, complete.evaluation(), check_dtype=False)
     assert contents(complete) == before
 
 
 def test_a_smaller_evaluation_does_not_replace_a_larger_one(complete: TrialStore) -> None:
     saved = SavedTrial.load(complete)
-    _, path = saved.evaluate(BOTH, num_episodes=20, seed=7)
+    path = saved.evaluate(BOTH, num_episodes=20, seed=7).path
     larger = path.read_bytes()
-    saved.evaluate(BOTH, num_episodes=20, seed=7)
-    assert not complete.aside_folder.exists()  # the same again
-    saved.evaluate(BOTH[:1], num_episodes=4, seed=7)
+    assert saved.evaluate(BOTH, num_episodes=20, seed=7).earlier is None  # the same again
+    assert not complete.aside_folder.exists()
+    earlier = saved.evaluate(BOTH[:1], num_episodes=4, seed=7).earlier
     assert len(path.read_bytes()) < len(larger)
-    assert [kept.read_bytes() for kept in complete.aside_folder.iterdir()] == [larger]
+    assert earlier is not None and earlier.read_bytes() == larger
+    assert list(complete.aside_folder.iterdir()) == [earlier]
 
 
 def test_another_seed_gives_other_episodes_and_the_same_seed_the_same(complete: TrialStore) -> None:
     saved = SavedTrial.load(complete)
-    once, path = saved.evaluate(BOTH[:1], num_episodes=20, seed=7)
-    again, _ = saved.evaluate(BOTH[:1], num_episodes=20, seed=7)
-    other, _ = saved.evaluate(BOTH[:1], num_episodes=20, seed=8)
-    assert path.name == "update-00000005__seed-7.csv"
-    assert once.equals(again)
-    assert not once.equals(other)
+    once, again, other = (saved.evaluate(BOTH[:1], num_episodes=20, seed=seed) for seed in (7, 7, 8))
+    assert once.path.name == "update-00000005__seed-7.csv"
+    assert once.rows.equals(again.rows)
+    assert not once.rows.equals(other.rows)
 
 
 @pytest.mark.parametrize(("horizon", "most"), [(10, "1,000"), (600, "1,200")])
