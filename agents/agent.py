@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -86,17 +86,6 @@ class DiscretePolicy(Protocol):
         ...
 
 
-@runtime_checkable
-class EntropyRewarded(Protocol):
-    """An agent whose ``update`` uses ``CurriculumStep.entropy_coefficient``; optional for agents.
-
-    Attributes:
-        learns_rewarded_entropy: a marker; its value is not used.
-    """
-
-    learns_rewarded_entropy: ClassVar[bool]
-
-
 class FinalPolicy(Policy, Protocol):
     """A policy that is evaluated: stochastic as it was trained, or by its mode."""
 
@@ -129,7 +118,8 @@ class Agent(FinalPolicy, Protocol):
                 mean costs are estimated from the steps so far; only a CVaR is unknown until a first episode
                 has finished.
             step: the curriculum's output for this update. Its limits may be infinite. Its policy noise has
-                already been added (``add_noise``). ``EntropyRewarded`` agents use its entropy coefficient.
+                already been added (``add_noise``). Its entropy coefficient is for agents that
+                ``learns_rewarded_entropy``.
 
         Returns:
             Metrics, finite or NaN; the keys are the same in every update.
@@ -158,6 +148,14 @@ class Agent(FinalPolicy, Protocol):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken."""
         ...
+
+
+def learns_rewarded_entropy(agent: Agent) -> bool:
+    """Return whether ``update`` uses ``CurriculumStep.entropy_coefficient``.
+
+    An agent says so by an attribute of this name that is true; without it, it does not.
+    """
+    return bool(getattr(agent, "learns_rewarded_entropy", False))
 
 
 def final_policy(agent: Agent) -> FinalPolicy:

@@ -42,9 +42,9 @@ def hard_landing_sentence(titles: Sequence[str]) -> str:
 
 
 def short_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
-    """Return the warning about trials whose deployment phase is shorter than an update; empty for none."""
+    """Return the warning about curricula whose deployment phase is shorter than an update; empty for none."""
     what = "the deployment phase is shorter than an update, so that no update learns under d_d"
-    short = [spec for spec in specs if spec.lacks_deployment]
+    short = [spec for spec in specs if spec.lacks_deployment and _is_relaxed(spec)]
     if not short:
         return ""
     rounding = 0.5  # of deploy_steps
@@ -55,9 +55,9 @@ def short_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
 
 def no_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
     """Return the warning about curricula without a deployment phase; empty for none."""
-    what = "deploy_fraction is 0, so that perhaps no update learns under d_d"
+    what = "there is no deployment phase, so that perhaps no update learns under d_d"
     lacking = [spec.title for spec in specs if not spec.deploy_steps and _is_relaxed(spec)]
-    return _warning(what, lacking, "give a deploy_fraction above 0")
+    return _warning(what, lacking, "give a larger deploy_fraction")
 
 
 def unrelaxed_sentence(specs: Sequence[TrialSpec]) -> str:

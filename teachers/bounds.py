@@ -65,6 +65,8 @@ def discounted_excess(kl: float, advantage: float, *, discount: float) -> float:
     if discount < 0.0 or discount > 1.0:  # unknown values, NaN, give NaN
         raise ValueError(f"discount must lie in [0, 1], got {discount}")
     _require_at_least_0(kl, advantage)
+    if kl == 0.0:
+        return 0.0  # whatever the advantage, which may be unbounded
     if discount == 1.0:
         return math.inf
     return math.sqrt(2 * kl) * discount * advantage / (1 - discount) ** 2

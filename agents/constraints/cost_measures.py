@@ -223,6 +223,9 @@ class MeanCost:
         life table. Until an episode has finished these are lower bounds: steps of later ages are not known.
         The table's standard error is that of a mean of as many episodes as it has steps of each age.
 
+        The table never forgets old steps wholly. So the mean of a cost is 0 exactly if no episode of the
+        window and no running one has it.
+
         Args:
             rollout: the steps.
             episodes: of the window.
@@ -234,7 +237,9 @@ class MeanCost:
             return MeasuredCosts(rollout.costs, episodes.costs.mean(axis=0), errors, episodes.mean_length)
         means = self._table.means()
         errors = errors * math.sqrt(len(episodes.costs) / means.number)
-        return MeasuredCosts(rollout.costs, means.costs, errors, means.length)
+        running = rollout.costs.any(axis=(0, 1)) | rollout.carried_costs.any(axis=0)
+        occurred = running | episodes.costs.any(axis=0)
+        return MeasuredCosts(rollout.costs, np.where(occurred, means.costs, 0.0), errors, means.length)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the life table."""

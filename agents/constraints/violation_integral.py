@@ -9,8 +9,8 @@ every controller:
     I <- max(I + K min(g, e), 0)    before the step; c is computed from g + I in place of g,
     I <- min(I, d + r)              after the step.
 
-**Where nothing costs.** If the mean episode cost is negligible beside I, c is computed from g. There is no
-cost to lower, and b is the noise of the cost's critic. Otherwise an I above d would ask for a cost below 0.
+**Where nothing costs.** If the mean episode cost is 0, c is computed from g. There is no cost to lower, and b
+is the noise of the cost's critic. Otherwise an I above d would ask for a cost below 0.
 
 **What a gap adds.** e = sqrt(d^2 + s^2), d the limit and s the standard error of the cost. An episode costs
 at least 0, so g is at least -d, but an untrained policy may exceed the limit by any amount. Without e a few
@@ -25,8 +25,9 @@ often biases the cost, because it removes high gaps and no low ones. So I still 
 the constraint at the present g + I. And r is a mean: that of a single update is small where its rollout
 happened to cost little.
 
-**Limits of 0.** Under a limit of 0 g is never negative. There, if g is negligible beside I, I falls by K I.
-A life table's estimate only approaches 0, so g needs not be 0 exactly.
+**Limits of 0.** Under a limit of 0 g is never negative. There, while nothing costs, I falls by K I, and the
+cost is no constraint of the step: b.x <= 0 would only project the step on noise. It is one again with the
+first cost.
 
 g, e and I are in episode cost, so K has no unit. In cost per step the request I would grow with the length of
 the episodes, as robots learn not to fall. K = 0 is the published algorithm.
@@ -46,7 +47,6 @@ import numpy.typing as npt
 from recrl.agents.experience import Constraints
 from recrl.environments.cmdp import Floats
 
-NEGLIGIBLE = 1e-6
 REACH_DECAY = 0.9  # of r, per update
 
 
@@ -69,16 +69,20 @@ class ViolationIntegral:
         return self._integral.copy()
 
     def corrected(self, constraints: Constraints) -> Constraints:
-        """Include new gaps, all known; return the constraints with the gaps from which c is computed."""
+        """Include new gaps, all known; return the constraints with the gaps from which c is computed.
+
+        A gap is -inf where there is no constraint.
+        """
         index = np.flatnonzero(np.isfinite(constraints.limits))
         gaps, limits = constraints.gaps[index], constraints.limits[index]
         sizes = np.hypot(limits, constraints.standard_errors[index])
         change = self._gain * np.where(sizes > 0.0, np.minimum(gaps, sizes), gaps)
-        costless = gaps + limits <= NEGLIGIBLE * self._integral[index]
+        costless = gaps + limits <= 0.0
         forgotten = np.where(costless & (limits == 0.0), self._gain * self._integral[index], 0.0)
         self._integral[index] = np.maximum(self._integral[index] + change - forgotten, 0.0)
         corrected = constraints.gaps.copy()
-        corrected[index] = np.where(costless, gaps, gaps + self._integral[index])
+        unneeded = np.where(limits > 0.0, gaps, -np.inf)
+        corrected[index] = np.where(costless, unneeded, gaps + self._integral[index])
         return replace(constraints, gaps=corrected)
 
     def bound(self, index: npt.NDArray[np.int64], limits: Floats, reach: Floats) -> None:

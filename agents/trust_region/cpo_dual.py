@@ -19,9 +19,9 @@ shortest step that meets A exactly, plus the rest of the trust region along the 
     p = q - r_A.S_AA^-1 r_A             squared length of the remaining gradient,
     lam = sqrt(p / (2 delta - m)),  nu_A = S_AA^-1 (lam c_A - r_A).
 
-Each of the at most 2^k candidates is the best point of its face. Candidates that also meet the constraints
-outside A are feasible; the best of them is the solution. For k = 1 that is nu = 0 or nu = (lam c - r) / s,
-lam = sqrt((q - r^2 / s) / (2 delta - c^2 / s)), as in the paper.
+Each of the at most 2^k candidates is the best point of its face. The problem is convex, so a candidate with
+nu >= 0 that also meets the constraints outside A is the solution (Karush, Kuhn and Tucker). For k = 1 that is
+nu = 0 or nu = (lam c - r) / s, lam = sqrt((q - r^2 / s) / (2 delta - c^2 / s)), as in the paper.
 
 If no candidate is feasible, no step within the trust region meets all constraints, and the step recovers. It
 goes towards the nearest point that meets them all, x = -sum_i nu_i w_i with nu >= 0 and S nu >= c (equality
@@ -47,10 +47,11 @@ from recrl.environments.cmdp import Floats
 # A step of length 1 changes a cost surrogate by at most sqrt(S_ii); below this square the effect is
 # negligible.
 NO_INFLUENCE = 1e-12
-# Squared lengths below this fraction of q are rounding errors.
-NO_GRADIENT = 1e-10
+# The products are of float32 gradients, each exact to about 1e-7 of its length. A squared length below this
+# fraction of q, or a block of S whose condition number exceeds the inverse, is a rounding error.
+ROUNDING = 1e-5
 # Tolerance of a constraint for rounding, as a fraction of what the trust region can change.
-FEASIBILITY_TOLERANCE = 1e-9
+FEASIBILITY_TOLERANCE = 1e-6
 
 
 class StepCase(IntEnum):
@@ -78,11 +79,6 @@ class StepProblem:
     gram: Floats
     violations: Floats
     radius: float
-
-    def objective(self, solution: DualSolution) -> float:
-        """Return g.x of a step; to first order, the reward surrogate rises by -g.x."""
-        mixed = float(solution.constraint_weights @ self.mixed)
-        return -(solution.gradient_weight * self.squared_gradient + mixed)
 
     def after(self, solution: DualSolution) -> Floats:
         """Return b_i.x + c_i, the violation of each constraint after a step, to first order, [k]."""
@@ -122,32 +118,27 @@ def solve_dual(problem: StepProblem) -> DualSolution:
     A constraint that no step can influence (S_ii about 0) is left out, whether it is met or not.
     """
     usable = tuple(i for i in range(len(problem.violations)) if problem.gram[i, i] > NO_INFLUENCE)
-    best: DualSolution | None = None
-    least = np.inf
     for size in range(len(usable) + 1):
         for binding in itertools.combinations(usable, size):
             candidate = _best_of_face(problem, binding)
-            if candidate is None or not _meets(problem, candidate, set(usable) - set(binding)):
-                continue
-            objective = problem.objective(candidate)
-            if objective < least:
-                best, least = candidate, objective
-    return best or _recovery(problem, usable)
+            if candidate is not None and _meets(problem, candidate, set(usable) - set(binding)):
+                return candidate
+    return _recovery(problem, usable)
 
 
 def _best_of_face(problem: StepProblem, binding: tuple[int, ...]) -> DualSolution | None:
-    """Return the best step that meets the ``binding`` constraints exactly, or None if there is none."""
+    """Return the best step that meets the ``binding`` constraints exactly, if there is one with nu >= 0."""
     index = list(binding)
     block = problem.gram[np.ix_(index, index)]
     bound, mixed = problem.violations[index], problem.mixed[index]
-    if index and np.linalg.cond(block) > 1.0 / NO_GRADIENT:
-        return None  # linearly dependent: a smaller set has the same face
+    if not _are_independent(block):
+        return None  # a smaller set has the same face
     to_meet, along = np.linalg.solve(block, np.stack([bound, mixed], axis=1)).T
     slack = 2.0 * problem.radius - float(bound @ to_meet)
     if slack < 0.0:
         return None
     remaining = problem.squared_gradient - float(mixed @ along)
-    has_gradient = remaining > NO_GRADIENT * problem.squared_gradient
+    has_gradient = remaining > ROUNDING * problem.squared_gradient
     gradient_weight = float(np.sqrt(slack / remaining)) if has_gradient else 0.0
     weights, multipliers = np.zeros_like(problem.mixed), np.zeros_like(problem.mixed)
     weights[index] = to_meet - gradient_weight * along
@@ -155,8 +146,22 @@ def _best_of_face(problem: StepProblem, binding: tuple[int, ...]) -> DualSolutio
         multipliers[index] = -along  # lam = 0
     else:  # lam is infinite if the face is a single point
         multipliers[index] = to_meet / gradient_weight - along if gradient_weight > 0.0 else np.nan
+    # nu / lam is in units of the trust region's radius, nu in those of the gradient
+    signs, unit = (weights, 2.0 * problem.radius) if has_gradient else (multipliers, problem.squared_gradient)
+    if np.any(signs[index] * np.sqrt(np.diag(block)) < -FEASIBILITY_TOLERANCE * np.sqrt(unit)):
+        return None
     case = StepCase.CONSTRAINED if binding else StepCase.UNCONSTRAINED
     return DualSolution(case, gradient_weight, weights, np.maximum(multipliers, 0.0), ())
+
+
+def _are_independent(block: Floats) -> bool:
+    """Whether constraints are linearly independent, up to rounding and whatever their units.
+
+    Args:
+        block: S of these constraints, with a positive diagonal.
+    """
+    lengths = np.sqrt(np.diag(block))
+    return not len(block) or bool(np.linalg.cond(block / np.outer(lengths, lengths)) <= 1.0 / ROUNDING)
 
 
 def _meets(problem: StepProblem, solution: DualSolution, constraints: set[int]) -> bool:
@@ -213,8 +218,8 @@ def projection_weights(gram: Floats, excesses: Floats) -> Floats | None:
         for binding in itertools.combinations(usable, size):
             index = list(binding)
             block = gram[np.ix_(index, index)]
-            if index and np.linalg.cond(block) > 1.0 / NO_GRADIENT:
-                continue  # linearly dependent: a smaller set has the same face
+            if not _are_independent(block):
+                continue  # a smaller set has the same face
             weights = np.zeros_like(excesses)
             weights[index] = np.linalg.solve(block, excesses[index])
             left = (excesses - gram @ weights)[usable]

@@ -21,6 +21,7 @@ has no final policy and an incomplete training: a claim does not hold in a seed 
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -32,6 +33,7 @@ from recrl.analysis.data.labels import KEY
 from recrl.analysis.statistics.intervals import (
     Interval,
     mean_interval,
+    paired_difference,
     wilson_interval,
 )
 from recrl.analysis.statistics.metrics import Measure
@@ -253,8 +255,9 @@ def _compared(
 ) -> dict[str, Any]:
     of_training = claim.quantity == TRAINING_COST
     deployed = deployed.iloc[:0] if of_training else deployed
-    differences, base = _differences(final, claim)
-    beside = _differences(deployed.assign(**{claim.quantity: deployed[RETURN]}), claim)[0]
+    values, base = _pairs(final, claim)
+    differences = values - base
+    beside = operator.sub(*_pairs(deployed.assign(**{claim.quantity: deployed[RETURN]}), claim))
     pairs = [
         None if of_training else int((~of.index.isin(rows.loc[~rows["feasible"].astype(bool), "seed"])).sum())
         for of, rows in ((differences, final), (beside, deployed))
@@ -262,7 +265,7 @@ def _compared(
     both = set.intersection(
         *(set(trials.loc[trials["method"] == name, "seed"]) for name in (claim.method, claim.against))
     )
-    interval, ground = mean_interval(_numbers(differences)), mean_interval(_numbers(base))
+    interval, ground = paired_difference(_numbers(values), _numbers(base)), mean_interval(_numbers(base))
     relative = interval.estimate / ground.estimate if ground.low > 0.0 else math.nan
     return {
         **_counted(differences > ROUNDING, beside > ROUNDING, failed=len(_failed_seeds(trials) & both)),
@@ -289,11 +292,11 @@ def _counted(held: pd.Series[bool], deployed: pd.Series[bool], *, failed: int) -
     }
 
 
-def _differences(rows: pd.DataFrame, claim: Comparison) -> tuple[pd.Series[float], pd.Series[float]]:
-    """Return by how much the method exceeds the other one, and the other one's value, for each seed."""
+def _pairs(rows: pd.DataFrame, claim: Comparison) -> tuple[pd.Series[float], pd.Series[float]]:
+    """Return the value of the method and of the other one, for each seed with both."""
     table = rows.pivot_table(index="seed", columns="method", values=claim.quantity, observed=True)
     table = table.reindex(columns=[claim.method, claim.against]).dropna()
-    return table[claim.method] - table[claim.against], table[claim.against]
+    return table[claim.method], table[claim.against]
 
 
 def _numbers(values: pd.Series[float]) -> Floats:

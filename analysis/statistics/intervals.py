@@ -85,7 +85,7 @@ def mean_and_standard_error(values: Floats) -> tuple[float, float]:
     """Return the mean of n values and its standard error s / sqrt(n), s with n - 1 degrees of freedom.
 
     Args:
-        values: [n]; for n = 0 both are NaN, for n = 1 the standard error is.
+        values: [n]; for n = 0 both are NaN. For n = 1 and for infinite values the standard error is.
 
     >>> mean_and_standard_error(np.array([1.0, 2.0, 3.0, 4.0, 5.0]))
     (3.0, 0.7071067811865476)
@@ -93,7 +93,8 @@ def mean_and_standard_error(values: Floats) -> tuple[float, float]:
     values = np.asarray(values, dtype=np.float64)
     count = len(values)
     mean = float(np.mean(values)) if count else math.nan
-    error = float(np.std(values, ddof=1) / math.sqrt(count)) if count > 1 else math.nan
+    with np.errstate(invalid="ignore"):  # infinite values have no standard error
+        error = float(np.std(values, ddof=1) / math.sqrt(count)) if count > 1 else math.nan
     return mean, error
 
 

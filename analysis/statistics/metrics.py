@@ -86,7 +86,7 @@ def with_finished_training(sweep: Sweep) -> pd.DataFrame:
 
 
 def training_totals(sweep: Sweep) -> pd.DataFrame:
-    """Return the cost of relaxed training: one row per trial with a finished training phase.
+    """Return the cost of relaxed training: a row per trial whose training phase is over and has an episode.
 
     Returns:
         KEY, episodes, steps; cost_i_total (the paper's SUM-J_C,i: all cost of training, within the limit or

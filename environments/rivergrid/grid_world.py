@@ -234,10 +234,16 @@ class RiverGridVectorEnv(FiniteVectorEnv):
 
 
 def task_map(name: str, options: RiverGridOptions) -> RiverMap:
-    """Return the map of a task: 1a, 1b, or that of the options."""
+    """Return the map of a task: 1a, 1b, or that of the options.
+
+    Raises:
+        ValueError: no agent can reach its goal within the horizon.
+    """
     if isinstance(options, RiverGridMapOptions | RiverGridGeneratedOptions):
         return options.river_map()
-    return parse_map(MAPS[name.removeprefix("rivergrid-")])
+    river_map = parse_map(MAPS[name.removeprefix("rivergrid-")])
+    require_reach(river_map, options.horizon, name)
+    return river_map
 
 
 def make_river_grid(name: str, num_envs: int, options: RiverGridOptions) -> RiverGridVectorEnv:

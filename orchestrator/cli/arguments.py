@@ -23,7 +23,7 @@ grid file, on all cores or a Ray cluster. Interrupted sweeps resume exactly."""
 EPILOG = """\
 A first sweep:
   recrl-sweep init                        write demo.yaml, a grid file with comments
-  recrl-sweep validate demo.yaml          check the file; all mistakes at once, with their lines
+  recrl-sweep validate demo.yaml          check the file; mistakes have their lines
   recrl-sweep plan demo.yaml --measure    show the trials, and estimates of time and memory
   recrl-sweep launch demo.yaml            run it, show progress, draw figures, print results
   recrl-sweep ui demo                     open it in MLflow

@@ -13,9 +13,16 @@ from rich.console import Console
 from recrl.environments.plugins import UnknownNameError, UntrustedNameError
 from recrl.orchestrator.cli.output import say, short, show
 from recrl.orchestrator.cli.requests import BoundRequest, ReplayRequest
-from recrl.orchestrator.cli.results import say_warnings, source
+from recrl.orchestrator.cli.results import require_undamaged, say_warnings, source
 from recrl.orchestrator.cli.sweeps import open_store
-from recrl.orchestrator.errors import TRUST_HINT, USERS_ERRORS, RecrlError, StorageError, described
+from recrl.orchestrator.errors import (
+    TRUST_HINT,
+    USERS_ERRORS,
+    DamagedError,
+    RecrlError,
+    StorageError,
+    described,
+)
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
@@ -40,6 +47,7 @@ def run_bound(request: BoundRequest, console: Console) -> ExitCode:
         raise RecrlError(f"--budget: must be at least 0, got {request.budget:g}")
     sweep, _ = source(request)
     say_warnings(sweep, console)
+    require_undamaged(sweep)
     try:
         indices = indices_of_cost(sweep, request.cost)
     except ValueError as error:
@@ -98,8 +106,9 @@ def run_replay(request: ReplayRequest, console: Console) -> ExitCode:
     for sentence in damaged:
         say(console, f"damaged: {sentence}")
     if not runs:
-        what = "is undamaged" if len(damaged) == len(specs) else "has a saved policy update yet"
-        raise RecrlError(f"{store.name}: none of the {len(specs)} chosen trials {what}")
+        if len(damaged) == len(specs):
+            raise DamagedError(f"{store.name}: all chosen trials are damaged")
+        raise RecrlError(f"{store.name}: no chosen trial has a saved policy update yet")
     say(console, f"What {method.label} would have set on the recorded episodes, in the training phase:")
     show(pd.concat(summaries), console)
     say(

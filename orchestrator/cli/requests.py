@@ -150,7 +150,7 @@ class PlanRequest(GridRequest):
 
 @dataclass(frozen=True)
 class ValidateRequest(Request):
-    """Check a grid file; all mistakes at once, with their lines."""
+    """Check a grid file; the mistakes of all entries at once, with their lines."""
 
     example: ClassVar[str] = "recrl-sweep validate demo.yaml"
     grid: Path = by_place(**_GRID)
@@ -295,7 +295,7 @@ class MergeRequest(Request):
     )
     to: Path = by_flag(type=types.zip_file, metavar="FILE.zip", required=True, help="the output file")
     finished: bool = by_flag(
-        action="store_true", help="leave out trials that are waiting or running; failed ones stay"
+        action="store_true", help="leave out trials that are waiting or running; failed and damaged ones stay"
     )
 
 

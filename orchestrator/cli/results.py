@@ -11,7 +11,7 @@ from recrl.orchestrator.cli.output import say, short
 from recrl.orchestrator.cli.requests import ExportRequest, FiguresRequest, MergeRequest, SourceRequest
 from recrl.orchestrator.cli.sweeps import open_store
 from recrl.orchestrator.counting import counted
-from recrl.orchestrator.errors import RecrlError, described
+from recrl.orchestrator.errors import DamagedError, RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid.checking import read_name
 from recrl.orchestrator.spec import TrialStatus
@@ -25,6 +25,7 @@ def run_figures(request: FiguresRequest, console: Console) -> ExitCode:
     """Draw the figures and tables of a sweep in its folder, an export or MLflow."""
     sweep, folder = source(request)
     say_warnings(sweep, console)
+    require_undamaged(sweep)
     folder = request.to or folder
     try:
         draw(sweep, folder, console, band=request.band, whole=not request.sketch)
@@ -73,6 +74,16 @@ def say_warnings(sweep: Sweep, console: Console) -> None:
         say(console, f"damaged: {sentence}")
     for sentence in doubts(sweep):
         say(console, f"warning: {sentence}")
+
+
+def require_undamaged(sweep: Sweep) -> None:
+    """Check that a trial is not damaged, before results are made of the sweep.
+
+    Raises:
+        DamagedError: all are; ``say_warnings`` has said why.
+    """
+    if sweep.facts and all(trial.status is TrialStatus.DAMAGED for trial in sweep.facts):
+        raise DamagedError(f"{sweep.name}: all trials are damaged")
 
 
 def _say_file(path: Path, sweep: Sweep, console: Console) -> None:

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from recrl.agents.agent import EntropyRewarded
+from recrl.agents.agent import learns_rewarded_entropy
 from recrl.agents.registry import AGENTS, make_agent
 from recrl.environments.cmdp import CMDPSpec, CostLimits
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
@@ -113,10 +113,10 @@ def _agents_mistake(spec: TrialSpec, cmdp: CMDPSpec, *, rewards_entropy: str, is
         agent = make_agent(spec.agent.name, cmdp, spec.agent.options, np.random.SeedSequence(0))
     except USERS_ERRORS as error:
         return f"cannot be built on {TASK_MARK}: {described_with_place(error)}"
-    if rewards_entropy and not isinstance(agent, EntropyRewarded):
+    if rewards_entropy and not learns_rewarded_entropy(agent):
         return (
             f"on {TASK_MARK} cannot learn a rewarded entropy, which the method {rewards_entropy} needs; give "
-            "it the attribute learns_rewarded_entropy, use another method, or exclude the pair"
+            "it the attribute learns_rewarded_entropy = True, use another method, or exclude the pair"
         )
     if not is_rehearsed:
         return ""

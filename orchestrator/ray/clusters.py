@@ -15,7 +15,7 @@ from typing import Any
 
 import ray
 
-from recrl.orchestrator.errors import ClusterError, first_line
+from recrl.orchestrator.errors import ClusterError, RecrlError, first_line
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.provenance.own_package import copy_package
 from recrl.orchestrator.ray.private_api import (
@@ -123,11 +123,12 @@ def existing_cluster(address: str, *, ship_package: bool = False) -> Iterator[No
         ship_package: whether to send recrl itself, without its dependencies, to the nodes.
 
     Raises:
+        RecrlError: the address is Ray Client's.
         ClusterError: there is none, this machine is no node of it, or it refuses our token.
     """
     failure = f"cannot use the Ray cluster at {address}"
     if "://" in address:  # Ray itself advises against Tune with Ray Client
-        raise ClusterError(
+        raise RecrlError(
             f"{failure}: the driver must run on a node of the cluster, not through Ray Client; "
             "launch there with --address auto, or make this machine a node: ray start "
             "--address=<host:port> --num-cpus=0"

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote, unquote
 
-from recrl.orchestrator.errors import TrackingError, described
+from recrl.orchestrator.errors import RecrlError, TrackingError, described
 from recrl.orchestrator.files.locks import locked
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.redaction import redacted
@@ -45,7 +45,7 @@ def tracking_uri(store: SweepStore, given: str | None) -> str:
         given: a server's address or a database's, as for MLflow, or None.
 
     Raises:
-        TrackingError: MLflow has no such kind of store.
+        RecrlError: MLflow has no such kind of store.
     """
     return _sqlite_uri(store.mlflow_database) if given is None else checked_uri(given)
 
@@ -54,15 +54,15 @@ def checked_uri(given: str) -> str:
     """Return the absolute address, if MLflow accepts it.
 
     Raises:
-        TrackingError: MLflow has no such kind of store.
+        RecrlError: MLflow has no such kind of store.
     """
     if not given.isprintable() or " " in given:
-        raise TrackingError("the tracking address must hold no spaces and no control characters")
+        raise RecrlError("the tracking address must hold no spaces and no control characters")
     scheme, separator, rest = given.partition("://")
     if scheme != "sqlite" and re.search(
         "[/?#].*@", rest
     ):  # other programs would take a part of it for a host
-        raise TrackingError(
+        raise RecrlError(
             "the tracking address must have no @ after its host; in a password write %2F for /, "
             "%3F for ?, %23 for # and %40 for @"
         )
@@ -70,7 +70,7 @@ def checked_uri(given: str) -> str:
         return _sqlite_uri(Path(unquote(rest.removeprefix("/"))).absolute())
     if separator and rest and scheme.partition("+")[0] in ("http", "https", "postgresql", "mysql", "mssql"):
         return given
-    raise TrackingError(
+    raise RecrlError(
         "the tracking address must be http(s)://host:port, sqlite:///file.db or another database "
         f"of MLflow (postgresql, mysql, mssql), got {redacted(given)!r}"
     )

@@ -23,7 +23,13 @@ from typing import Any, Self
 
 import numpy as np
 
-from recrl.agents.agent import Agent, DiscretePolicy, EntropyRewarded, FinalPolicy, final_policy
+from recrl.agents.agent import (
+    Agent,
+    DiscretePolicy,
+    FinalPolicy,
+    final_policy,
+    learns_rewarded_entropy,
+)
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
 from recrl.agents.evaluation import FrozenPolicy, evaluate
 from recrl.agents.registry import make_agent
@@ -252,7 +258,7 @@ class Trial:
                 f"curriculum {label}: a step has an entropy_coefficient, so its TeacherKind must have "
                 "rewards_entropy=True"
             )
-        if step.rewards_entropy and not isinstance(self._agent, EntropyRewarded):
+        if step.rewards_entropy and not learns_rewarded_entropy(self._agent):
             raise TypeError(
                 f"method {self.spec.method.name} rewards entropy, which agent {self.spec.agent.name} does "
                 "not support; choose another of the two"

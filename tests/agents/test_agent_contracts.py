@@ -10,7 +10,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
-from recrl.agents.agent import Agent, EntropyRewarded, Rollout
+from recrl.agents.agent import Agent, Rollout, learns_rewarded_entropy
 from recrl.agents.algorithms.cpo import ConstrainedPolicyOptimisation
 from recrl.agents.algorithms.own_options import CPOConfig
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
@@ -195,7 +195,7 @@ def test_noise_returns_the_same_metrics_and_keeps_the_agent_learning(agent: str,
 def test_entropy_that_is_rewarded_rises_in_that_update_alone(agent: str, task: str) -> None:
     plain, warm = (Lessons(agent, task, {"compaction": False}) for _ in range(2))
     for each in (plain, warm):
-        assert isinstance(each.agent, EntropyRewarded)
+        assert learns_rewarded_entropy(each.agent)
         for _ in range(2):
             each.update()
     kept = 1000.0  # an agent that recovers from a violation looks at nothing else

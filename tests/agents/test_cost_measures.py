@@ -187,6 +187,16 @@ def test_where_few_episodes_finished_the_mean_is_that_of_the_steps() -> None:
         assert found.standard_errors.tolist() == pytest.approx([2.0 / math.sqrt(2.0)])
 
 
+def test_a_cost_that_no_recent_and_no_running_episode_has_is_0_exactly() -> None:
+    """The life table alone would only approach 0."""
+    mean, none = MeanCost(4, 1), np.zeros((2, 1))
+    assert mean.measure(rollout_of(np.ones((2, 1))), NONE, np.zeros(1)).values.tolist() == [2.0]
+    running = replace(rollout_of(none), carried_costs=np.ones((1, 1)))
+    assert mean.measure(running, NONE, np.zeros(1)).values.tolist() == [1.0]
+    assert mean.measure(rollout_of(none), episodes_of(1.0, finished=0), np.zeros(1)).values[0] > 0.5
+    assert mean.measure(rollout_of(none), episodes_of(0.0, finished=0), np.zeros(1)).values.tolist() == [0.0]
+
+
 def test_a_life_table_by_hand() -> None:
     """Ages 0 to 2: of two steps each none, one and one end an episode; of age 1 they cost 2, of age 2 4.
 

@@ -118,6 +118,29 @@ def test_the_same_constraint_twice_changes_nothing() -> None:
     assert step(twice, -EAST, costs) == pytest.approx(step(once, -EAST, NORTH[None]))
 
 
+@pytest.mark.parametrize("angle", [1e-9, 1e-7, 1e-5])
+def test_a_constraint_that_differs_by_float32s_rounding_changes_nothing(angle: float) -> None:
+    """Products of almost parallel gradients have rounding errors that must not look like a direction."""
+    generator = np.random.default_rng(2)
+    cases = Counter[StepCase]()
+    for _ in range(300):
+        gradient, cost, other = generator.normal(size=(3, 6))
+        violation, another = 0.3 * generator.normal(size=2)
+        twin, costs = cost + angle * generator.normal(size=6), np.stack([cost, other])
+        violations = np.array([violation, another, violation + angle * generator.normal()])
+        rounded = np.stack([gradient, *costs, twin]).astype(np.float32)
+        products = (rounded @ rounded.T).astype(np.float64)
+        solution = solve_dual(
+            StepProblem(products[0, 0], products[0, 1:], products[1:, 1:], violations, 0.01)
+        )
+        once = solve_dual(reduced(gradient, costs, violations[:2], 0.01))
+        assert solution.case is once.case
+        found = step(solution, gradient, np.stack([*costs, twin]))
+        assert found == pytest.approx(step(once, gradient, costs), abs=2e-3 * math.sqrt(0.02))
+        cases[solution.case] += 1
+    assert min(cases[case] for case in StepCase) > 20
+
+
 def published(problem: StepProblem) -> tuple[float, float]:
     """1 / lam and nu / lam for k = 1 by safety-starter-agents' case distinction."""
     q, r, s = problem.squared_gradient, problem.mixed[0], problem.gram[0, 0]

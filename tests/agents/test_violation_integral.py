@@ -79,8 +79,6 @@ def test_a_limit_of_0_that_is_kept_forgets_old_violations() -> None:
     for expected in (0.5, 0.25):
         after(integral, 0.0, limit=0.0)
         assert integral.values.tolist() == [expected]
-    after(integral, 1e-9, limit=0.0)  # a life table's estimate only approaches 0
-    assert integral.values.tolist() == pytest.approx([0.125])
 
 
 def test_where_nothing_costs_the_integral_asks_for_nothing() -> None:
@@ -90,8 +88,12 @@ def test_where_nothing_costs_the_integral_asks_for_nothing() -> None:
     integral = ViolationIntegral(0.5, 1)
     after(integral, 2.0, limit=1.0)
     assert after(integral, -1.0, limit=1.0) == [-1.0]
-    after(integral, 4.0, limit=1.0)
-    assert after(integral, 1e-9, limit=0.0) == [1e-9]
+
+
+def test_a_limit_of_0_is_no_constraint_of_the_step_while_nothing_costs() -> None:
+    integral = ViolationIntegral(0.5, 2)
+    assert after(integral, 0.0, 2.0, limit=0.0) == [-math.inf, 3.0]
+    assert after(integral, 1.0, 0.0, limit=0.0) == [1.5, -math.inf]
 
 
 def test_a_known_cost_under_a_limit_of_0_counts() -> None:

@@ -138,6 +138,18 @@ def test_a_complete_trial_that_was_cut_is_damaged_and_its_numbers_are_not_used(
         assert f"damaged: {title}: {sentence}\n" in capsys.readouterr().out
 
 
+def test_a_sweep_without_an_undamaged_trial_has_no_results(
+    store: SweepStore, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for trial in store.trials():
+        cut(trial.episodes_path)
+    for command in ("bound", "figures"):
+        assert main([command, "small"]) == ExitCode.CANNOT_RUN
+        assert capsys.readouterr().err == "recrl-sweep: small: all trials are damaged\n"
+    assert main(["replay", "small", "--teacher", "cosine"]) == ExitCode.CANNOT_RUN
+    assert capsys.readouterr().err == "recrl-sweep: small: all chosen trials are damaged\n"
+
+
 def test_a_flipped_byte_in_a_complete_trial_is_found_by_its_digest(
     store: SweepStore, capsys: pytest.CaptureFixture[str]
 ) -> None:

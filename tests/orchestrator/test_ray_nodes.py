@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from recrl.orchestrator.cli.main import main
-from recrl.orchestrator.errors import ClusterError, GridError
+from recrl.orchestrator.errors import GridError, RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.provenance.own_package import copy_package, source_digest
@@ -78,7 +78,7 @@ print(importlib.metadata.version("recrl"), importlib.metadata.distribution("recr
 def test_ray_client_is_refused() -> None:
     with (
         pytest.raises(
-            ClusterError,
+            RecrlError,
             match=r"^cannot use the Ray cluster at ray://head:10001: the driver must run on a node of the "
             r"cluster, not through Ray Client; launch there with --address auto, or make this machine a ",
         ),

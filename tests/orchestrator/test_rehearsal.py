@@ -124,10 +124,7 @@ class Listed(NoNoise):
 
 
 class NoEntropy(Wrapped):
-    def __getattr__(self, name):
-        if name == "learns_rewarded_entropy":
-            raise AttributeError(name)
-        return getattr(self.agent, name)
+    learns_rewarded_entropy = False
 
 
 class Reordered(NoMode):
@@ -313,8 +310,8 @@ def test_an_agent_that_meets_a_curriculum_which_rewards_entropy() -> None:
     (problem,) = problems(agents=["own_rehearsed:NO_ENTROPY"], methods=["none", "cooling"])
     assert problem == (
         "grid.yaml:3: agents.0: own_rehearsed:NO_ENTROPY on two-state cannot learn a rewarded entropy, which "
-        "the method cooling needs; give it the attribute learns_rewarded_entropy, use another method, or "
-        "exclude the pair"
+        "the method cooling needs; give it the attribute learns_rewarded_entropy = True, use another method, "
+        "or exclude the pair"
     )
 
 

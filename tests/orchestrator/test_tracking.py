@@ -24,7 +24,7 @@ from recrl.analysis.data import sweep_data
 from recrl.analysis.report import table_files as sweep_tables
 from recrl.environments.cmdp import CostLimits
 from recrl.orchestrator.cli.main import main
-from recrl.orchestrator.errors import TrackingError
+from recrl.orchestrator.errors import RecrlError, TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
@@ -305,7 +305,7 @@ def test_a_database_may_lie_below_any_folder(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("given", ["mlruns", "file:///tmp/mlruns", "http://", "sqlite:///", "databricks"])
 def test_a_place_that_mlflow_cannot_keep_a_sweep_in_is_refused(tmp_path: Path, given: str) -> None:
-    with pytest.raises(TrackingError, match=r"^the tracking address must be .*, got '"):
+    with pytest.raises(RecrlError, match=r"^the tracking address must be .*, got '"):
         tracking_uri(SweepStore(tmp_path, "demo"), given)
 
 
