@@ -1,6 +1,6 @@
 """Experience of a rollout: samples, advantages and constraints.
 
-Notation: N samples, k costs, D unique pairs, E finished episodes, j of the k costs are constrained.
+Notation: N samples, k costs, D unique pairs, E finished episodes, j of the k limits are finite.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Constraints:
     Attributes:
         limits: d, [k], possibly infinite.
         gaps: constrained value (the mean undiscounted episode cost, or its CVaR) minus limit, [k]; -inf where
-            there is no constraint, as with an infinite limit; NaN where the value is unknown.
+            the limit is infinite, NaN where it is finite and the value is unknown.
         standard_errors: of the constrained values, [k], at least 0; 0 if they are unknown.
         episode_length: mean steps of an episode, at least 1; NaN if unknown.
     """
@@ -44,7 +44,7 @@ class Constraints:
 
 @dataclass(frozen=True, eq=False)
 class ActiveConstraints:
-    """The costs that are constrained, j of k.
+    """The constraints whose limits are finite, j of k.
 
     Attributes:
         index: their indices, [j].
@@ -57,8 +57,8 @@ class ActiveConstraints:
 
     @classmethod
     def of(cls, constraints: Constraints) -> ActiveConstraints:
-        """Return the constraints in the unit of the surrogates: cost per step."""
-        index = np.flatnonzero(~np.isneginf(constraints.gaps))
+        """Return the finite constraints, in the unit of the surrogates: cost per step."""
+        index = np.flatnonzero(np.isfinite(constraints.limits))
         return cls(index, constraints.gaps[index] / constraints.episode_length)
 
     def divided_by(self, units: Floats) -> ActiveConstraints:

@@ -65,8 +65,8 @@ def discounted_excess(kl: float, advantage: float, *, discount: float) -> float:
     if discount < 0.0 or discount > 1.0:  # unknown values, NaN, give NaN
         raise ValueError(f"discount must lie in [0, 1], got {discount}")
     _require_at_least_0(kl, advantage)
-    if kl == 0.0:
-        return 0.0  # whatever the advantage, which may be unbounded
+    if kl == 0.0 and not math.isnan(advantage):
+        return 0.0  # the policy has not changed, so an advantage without a bound does not matter
     if discount == 1.0:
         return math.inf
     return math.sqrt(2 * kl) * discount * advantage / (1 - discount) ** 2
@@ -94,7 +94,8 @@ def undiscounted_excess(kl: float, advantage: float, *, horizon: int) -> float:
     if horizon < 1:
         raise ValueError(f"horizon must be at least 1, got {horizon}")
     _require_at_least_0(kl, advantage)
-    return math.sqrt(2 * kl) * horizon * (horizon - 1) * advantage
+    excess = math.sqrt(2 * kl) * horizon * (horizon - 1)
+    return excess * advantage if excess or math.isnan(advantage) else 0.0
 
 
 def weight_sum(curriculum: str, policies: int) -> float:

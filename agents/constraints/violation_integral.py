@@ -25,9 +25,7 @@ often biases the cost, because it removes high gaps and no low ones. So I still 
 the constraint at the present g + I. And r is a mean: that of a single update is small where its rollout
 happened to cost little.
 
-**Limits of 0.** Under a limit of 0 g is never negative. There, while nothing costs, I falls by K I, and the
-cost is no constraint of the step: b.x <= 0 would only project the step on noise. It is one again with the
-first cost.
+**Limits of 0.** Under a limit of 0 g is never negative. There, while nothing costs, I falls by K I.
 
 g, e and I are in episode cost, so K has no unit. In cost per step the request I would grow with the length of
 the episodes, as robots learn not to fall. K = 0 is the published algorithm.
@@ -69,10 +67,7 @@ class ViolationIntegral:
         return self._integral.copy()
 
     def corrected(self, constraints: Constraints) -> Constraints:
-        """Include new gaps, all known; return the constraints with the gaps from which c is computed.
-
-        A gap is -inf where there is no constraint.
-        """
+        """Include new gaps, all known; return the constraints with the gaps from which c is computed."""
         index = np.flatnonzero(np.isfinite(constraints.limits))
         gaps, limits = constraints.gaps[index], constraints.limits[index]
         sizes = np.hypot(limits, constraints.standard_errors[index])
@@ -81,8 +76,7 @@ class ViolationIntegral:
         forgotten = np.where(costless & (limits == 0.0), self._gain * self._integral[index], 0.0)
         self._integral[index] = np.maximum(self._integral[index] + change - forgotten, 0.0)
         corrected = constraints.gaps.copy()
-        unneeded = np.where(limits > 0.0, gaps, -np.inf)
-        corrected[index] = np.where(costless, unneeded, gaps + self._integral[index])
+        corrected[index] = np.where(costless, gaps, gaps + self._integral[index])
         return replace(constraints, gaps=corrected)
 
     def bound(self, index: npt.NDArray[np.int64], limits: Floats, reach: Floats) -> None:

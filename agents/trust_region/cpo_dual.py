@@ -143,12 +143,14 @@ def _best_of_face(problem: StepProblem, binding: tuple[int, ...]) -> DualSolutio
     weights, multipliers = np.zeros_like(problem.mixed), np.zeros_like(problem.mixed)
     weights[index] = to_meet - gradient_weight * along
     if not has_gradient:
-        multipliers[index] = -along  # lam = 0
+        multipliers[index] = -along  # lam is at most sqrt(ROUNDING q / slack), about 0
+        smallest = -np.sqrt(ROUNDING * problem.squared_gradient)
+        is_best = np.all(multipliers[index] * np.sqrt(np.diag(block)) >= smallest)
     else:  # lam is infinite if the face is a single point
         multipliers[index] = to_meet / gradient_weight - along if gradient_weight > 0.0 else np.nan
-    # nu / lam is in units of the trust region's radius, nu in those of the gradient
-    signs, unit = (weights, 2.0 * problem.radius) if has_gradient else (multipliers, problem.squared_gradient)
-    if np.any(signs[index] * np.sqrt(np.diag(block)) < -FEASIBILITY_TOLERANCE * np.sqrt(unit)):
+        smallest = -FEASIBILITY_TOLERANCE * np.sqrt(2.0 * problem.radius)
+        is_best = np.all(weights[index] * np.sqrt(np.diag(block)) >= smallest)
+    if not is_best:
         return None
     case = StepCase.CONSTRAINED if binding else StepCase.UNCONSTRAINED
     return DualSolution(case, gradient_weight, weights, np.maximum(multipliers, 0.0), ())

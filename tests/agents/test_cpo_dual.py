@@ -54,6 +54,15 @@ def test_the_constraint_that_points_against_the_reward_binds() -> None:
     assert (step(solution, gradient, costs) @ EAST) == pytest.approx(0.25)
 
 
+@pytest.mark.parametrize("beside", [1e-4, 1e-3, 3e-3])
+def test_a_reward_that_is_almost_a_cost_still_meets_the_other_constraints(beside: float) -> None:
+    gradient, costs = -EAST + beside * NORTH, np.stack([EAST, NORTH])
+    solution = solve_dual(reduced(gradient, costs, np.array([-0.2, 0.3]), 0.5))
+    assert solution.case is StepCase.CONSTRAINED
+    found = step(solution, gradient, costs)
+    assert found @ EAST == pytest.approx(0.2) and found @ NORTH <= -0.3 + 1e-9
+
+
 def test_recovery_goes_towards_the_nearest_point_that_meets_all_constraints() -> None:
     # Cost 1 is in units a hundred times smaller: that point is 10 steps of length 1 west and 5 south.
     costs = np.stack([EAST, 100.0 * NORTH])

@@ -90,12 +90,6 @@ def test_where_nothing_costs_the_integral_asks_for_nothing() -> None:
     assert after(integral, -1.0, limit=1.0) == [-1.0]
 
 
-def test_a_limit_of_0_is_no_constraint_of_the_step_while_nothing_costs() -> None:
-    integral = ViolationIntegral(0.5, 2)
-    assert after(integral, 0.0, 2.0, limit=0.0) == [-math.inf, 3.0]
-    assert after(integral, 1.0, 0.0, limit=0.0) == [1.5, -math.inf]
-
-
 def test_a_known_cost_under_a_limit_of_0_counts() -> None:
     """Without a standard error nothing but the gap itself bounds what it adds."""
     integral = ViolationIntegral(0.5, 1)

@@ -87,6 +87,15 @@ def test_ray_client_is_refused() -> None:
         pass
 
 
+def test_an_address_of_ray_client_is_a_wrong_argument(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "grid.yaml").write_text(GRID)
+    monkeypatch.chdir(tmp_path)
+    assert main(["launch", "grid.yaml", "--address", "ray://head:10001"]) == ExitCode.WRONG_INPUT
+    assert "not through Ray Client" in capsys.readouterr().err
+
+
 def test_an_object_store_is_no_results_folder(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
         main(["launch", "grid.yaml", "--root", "s3://bucket/runs"])

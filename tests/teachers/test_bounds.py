@@ -41,6 +41,8 @@ def test_lemma_1_says_nothing_without_a_discount() -> None:
 def test_an_update_that_changes_nothing_exceeds_nothing() -> None:
     assert discounted_excess(0.0, 3.0, discount=0.99) == 0.0
     assert discounted_excess(0.0, math.inf, discount=0.99) == 0.0
+    assert math.isnan(discounted_excess(0.0, math.nan, discount=0.99))
+    assert undiscounted_excess(0.0, math.inf, horizon=200) == 0.0
     assert undiscounted_excess(0.0, 3.0, horizon=200) == 0.0
     assert undiscounted_excess(0.02, 3.0, horizon=1) == 0.0
 
