@@ -118,8 +118,8 @@ class Agent(FinalPolicy, Protocol):
                 mean costs are estimated from the steps so far; only a CVaR is unknown until a first episode
                 has finished.
             step: the curriculum's output for this update. Its limits may be infinite. Its policy noise has
-                already been added (``add_noise``). Its entropy coefficient is for agents that
-                ``learns_rewarded_entropy``.
+                already been added (``add_noise``). Agents for which
+                ``learns_rewarded_entropy`` is true use its entropy coefficient.
 
         Returns:
             Metrics, finite or NaN; the keys are the same in every update.

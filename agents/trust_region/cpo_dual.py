@@ -142,16 +142,17 @@ def _best_of_face(problem: StepProblem, binding: tuple[int, ...]) -> DualSolutio
     gradient_weight = float(np.sqrt(slack / remaining)) if has_gradient else 0.0
     weights, multipliers = np.zeros_like(problem.mixed), np.zeros_like(problem.mixed)
     weights[index] = to_meet - gradient_weight * along
-    if not has_gradient:
-        multipliers[index] = -along  # lam is at most sqrt(ROUNDING q / slack), about 0
-        smallest = -np.sqrt(ROUNDING * problem.squared_gradient)
-        is_best = np.all(multipliers[index] * np.sqrt(np.diag(block)) >= smallest)
-    else:  # lam is infinite if the face is a single point
+    lengths = np.sqrt(np.diag(block))
+    if has_gradient:  # lam is infinite if the face is a single point
         multipliers[index] = to_meet / gradient_weight - along if gradient_weight > 0.0 else np.nan
-        smallest = -FEASIBILITY_TOLERANCE * np.sqrt(2.0 * problem.radius)
-        is_best = np.all(weights[index] * np.sqrt(np.diag(block)) >= smallest)
-    if not is_best:
-        return None
+        pushes = weights[index] * lengths / np.sqrt(2.0 * problem.radius)
+        tolerance = FEASIBILITY_TOLERANCE
+    else:  # lam is at most sqrt(ROUNDING q / slack), about 0
+        multipliers[index] = -along
+        pushes = multipliers[index] * lengths
+        tolerance = np.sqrt(ROUNDING * problem.squared_gradient)
+    if np.any(pushes < -tolerance):
+        return None  # nu < 0: without one of the constraints there is a better step
     case = StepCase.CONSTRAINED if binding else StepCase.UNCONSTRAINED
     return DualSolution(case, gradient_weight, weights, np.maximum(multipliers, 0.0), ())
 

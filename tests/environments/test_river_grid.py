@@ -230,11 +230,7 @@ def test_an_action_that_minigrid_has_but_rivergrid_has_not_is_refused() -> None:
         ("rivergrid-1a", {"observation": "Joint"}, "Input should be 'factored' or 'joint'"),
         ("rivergrid-1a", {"costs": ("foo",)}, "Input should be 'river', 'turns' or 'mud'"),
         ("rivergrid-1a", {"horizon": 0}, "Input should be greater than or equal to 1"),
-        (
-            "rivergrid-1a",
-            {"horizon": 5},
-            "horizon must be at least 6, the steps to the goal of",
-        ),
+        ("rivergrid-1a", {"horizon": 5}, "horizon must be at least 6, the steps to the goal of"),
         ("rivergrid-1a", {"max_steps": 9}, "max_steps"),
         ("rivergrid", {}, "map"),
         ("rivergrid-1c", {}, "task must be one of rivergrid-1a, rivergrid-1b, rivergrid, rivergrid-gen"),

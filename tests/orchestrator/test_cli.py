@@ -747,7 +747,7 @@ SCRIPT = "import sys; sys.path.remove(''); from recrl.orchestrator.cli.main impo
 
 
 def test_modules_in_the_working_directory_are_found(folder: Path) -> None:
-    """The installed command does not look there by itself. A tutorial shows that Ray's workers do, too."""
+    """Python searches the folder of the installed command only. A tutorial shows it for Ray's workers."""
     other = "name: gymnasium, deploy_limits: 2, options: {id: 'room_a:Room-v0'}}, {name: 'room_a:Room'"
     _own_room(folder, "room_a", "{'cost': 1.0}", other)
     done = _python(SCRIPT.format(["validate", "grid.yaml", "--trust"]), folder)

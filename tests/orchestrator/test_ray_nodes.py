@@ -81,10 +81,11 @@ def test_ray_client_is_refused() -> None:
             RecrlError,
             match=r"^cannot use the Ray cluster at ray://head:10001: the driver must run on a node of the "
             r"cluster, not through Ray Client; launch there with --address auto, or make this machine a ",
-        ),
+        ) as caught,
         existing_cluster("ray://head:10001"),
     ):
         pass
+    assert type(caught.value) is RecrlError  # a wrong argument, and not a cluster that is away
 
 
 def test_an_address_of_ray_client_is_a_wrong_argument(

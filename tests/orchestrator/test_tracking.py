@@ -305,8 +305,9 @@ def test_a_database_may_lie_below_any_folder(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("given", ["mlruns", "file:///tmp/mlruns", "http://", "sqlite:///", "databricks"])
 def test_a_place_that_mlflow_cannot_keep_a_sweep_in_is_refused(tmp_path: Path, given: str) -> None:
-    with pytest.raises(RecrlError, match=r"^the tracking address must be .*, got '"):
+    with pytest.raises(RecrlError, match=r"^the tracking address must be .*, got '") as caught:
         tracking_uri(SweepStore(tmp_path, "demo"), given)
+    assert type(caught.value) is RecrlError  # a wrong argument, and not an MLflow that is away
 
 
 @pytest.mark.parametrize(
