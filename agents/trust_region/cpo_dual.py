@@ -47,9 +47,12 @@ from recrl.environments.cmdp import Floats
 # A step of length 1 changes a cost surrogate by at most sqrt(S_ii); below this square the effect is
 # negligible.
 NO_INFLUENCE = 1e-12
-# The products are of float32 gradients, each exact to about 1e-7 of its length. A squared length below this
-# fraction of q, or a block of S whose condition number exceeds the inverse, is a rounding error.
-ROUNDING = 1e-5
+# The largest condition number of linearly independent constraints. The products are of float32 gradients,
+# each exact to about 1e-7 of its length.
+LARGEST_CONDITION = 1e5
+# Squared lengths below this fraction of q are rounding errors: with at most one binding constraint, and with
+# several, where the condition number multiplies the errors.
+ROUNDING, ROUNDING_OF_SEVERAL = 1e-10, 1e-5
 # Tolerance of a constraint for rounding, as a fraction of what the trust region can change.
 FEASIBILITY_TOLERANCE = 1e-6
 
@@ -138,7 +141,8 @@ def _best_of_face(problem: StepProblem, binding: tuple[int, ...]) -> DualSolutio
     if slack < 0.0:
         return None
     remaining = problem.squared_gradient - float(mixed @ along)
-    has_gradient = remaining > ROUNDING * problem.squared_gradient
+    negligible = (ROUNDING_OF_SEVERAL if len(binding) > 1 else ROUNDING) * problem.squared_gradient
+    has_gradient = remaining > negligible
     gradient_weight = float(np.sqrt(slack / remaining)) if has_gradient else 0.0
     weights, multipliers = np.zeros_like(problem.mixed), np.zeros_like(problem.mixed)
     weights[index] = to_meet - gradient_weight * along
@@ -147,10 +151,10 @@ def _best_of_face(problem: StepProblem, binding: tuple[int, ...]) -> DualSolutio
         multipliers[index] = to_meet / gradient_weight - along if gradient_weight > 0.0 else np.nan
         pushes = weights[index] * lengths / np.sqrt(2.0 * problem.radius)
         tolerance = FEASIBILITY_TOLERANCE
-    else:  # lam is at most sqrt(ROUNDING q / slack), about 0
+    else:  # lam is at most sqrt(negligible / slack), about 0
         multipliers[index] = -along
         pushes = multipliers[index] * lengths
-        tolerance = np.sqrt(ROUNDING * problem.squared_gradient)
+        tolerance = np.sqrt(negligible)
     if np.any(pushes < -tolerance):
         return None  # nu < 0: without one of the constraints there is a better step
     case = StepCase.CONSTRAINED if binding else StepCase.UNCONSTRAINED
@@ -164,7 +168,7 @@ def _are_independent(block: Floats) -> bool:
         block: S of these constraints, with a positive diagonal.
     """
     lengths = np.sqrt(np.diag(block))
-    return not len(block) or bool(np.linalg.cond(block / np.outer(lengths, lengths)) <= 1.0 / ROUNDING)
+    return not len(block) or bool(np.linalg.cond(block / np.outer(lengths, lengths)) <= LARGEST_CONDITION)
 
 
 def _meets(problem: StepProblem, solution: DualSolution, constraints: set[int]) -> bool:
