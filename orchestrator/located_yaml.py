@@ -7,11 +7,13 @@ is ten, and ``1e6`` is a number.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import yaml
 
 # Place of a value: keys and list indices from the root, for example ("methods", 1, "options").
@@ -125,6 +127,47 @@ for _tag, _pattern, _first in (
     ),
 ):
     _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), _first)
+
+
+_KINDS: tuple[Any, ...] = (dict, list, tuple, str, bool, int, float, type(None), None)  # None: refuses others
+_PLAIN = {kind: yaml.SafeDumper.yaml_representers[kind] for kind in _KINDS}
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writer of what ``_Loader`` reads as the same values."""
+
+    yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
+    yaml_representers = _PLAIN
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Write a list that occurs twice twice."""
+        return True
+
+
+_AS_PLAIN: Mapping[type, Callable[[Any, Any], yaml.Node]] = {  # also of subclasses
+    dict: yaml.SafeDumper.represent_dict,
+    list: yaml.SafeDumper.represent_list,
+    str: lambda dumper, text: dumper.represent_str(str.__str__(text)),
+    np.generic: lambda dumper, scalar: dumper.represent_data(scalar.item()),
+    np.ndarray: lambda dumper, array: dumper.represent_data(array.tolist()),
+}
+for _type, _represent in _AS_PLAIN.items():
+    _Dumper.add_multi_representer(_type, _represent)
+
+
+def dump(value: Mapping[str, Any]) -> bytes:
+    """Write plain values as YAML that ``parse`` reads; scalars and arrays of NumPy are plain.
+
+    Raises:
+        TypeError: a value is not plain.
+    """
+    try:
+        text = yaml.dump(dict(value), Dumper=_Dumper, sort_keys=False, width=math.inf)
+    except yaml.representer.RepresenterError as error:
+        raise TypeError(f"{error.args[0]}: {error.args[-1]!r}") from error
+    except RecursionError as error:
+        raise TypeError("a value contains itself") from error
+    return text.encode()
 
 
 _SCALARS: Mapping[str, Callable[[str], Any]] = {

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote, unquote
 
 from recrl.orchestrator.errors import RecrlError, TrackingError, described
 from recrl.orchestrator.files.locks import locked
+from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.redaction import redacted
 
@@ -91,17 +93,30 @@ def _sqlite_uri(path: Path) -> str:
     return f"{SQLITE}{quote(str(path))}"
 
 
-def connect(uri: str, *, settings: Mapping[str, str] = MLFLOW_SETTINGS) -> MlflowClient:
+@contextmanager
+def mlflow_settings(settings: Mapping[str, str]) -> Iterator[None]:
+    """Set those of MLflow's environment variables that the user has not set, and remove them at the end."""
+    added = {key: value for key, value in settings.items() if key not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for key in added:
+            os.environ.pop(key, None)
+
+
+def connect(uri: str) -> MlflowClient:
     """Return a client of a store; a missing sqlite file is created.
+
+    ``MLFLOW_SETTINGS`` stay set, but for a caller within ``mlflow_settings``.
 
     Args:
         uri: of ``tracking_uri``.
-        settings: of MLflow, as environment variables; the user's own environment has priority.
 
     Raises:
         Exception: raised by mlflow if the store cannot be used.
     """
-    for key, value in settings.items():
+    for key, value in MLFLOW_SETTINGS.items():
         os.environ.setdefault(key, value)
     from mlflow.tracking import MlflowClient  # noqa: PLC0415
 
@@ -123,14 +138,12 @@ def _make_database(path: Path) -> None:
     from mlflow.tracking import MlflowClient  # noqa: PLC0415
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.unlink(missing_ok=True)
-    MlflowClient(_sqlite_uri(temporary)).search_experiments(max_results=1)
-    with locked(path.with_name(f".{path.name}.lock")):
-        if path.exists():  # another launch made it meanwhile, and may have written to it
-            temporary.unlink()
-        else:
-            temporary.replace(path)
+    with scratch_folder(str(path.parent), prefix=f".{path.name}-") as folder:
+        temporary = folder / path.name
+        MlflowClient(_sqlite_uri(temporary)).search_experiments(max_results=1)
+        with locked(path.with_name(f".{path.name}.lock")):
+            if not path.exists():  # another launch may have made it meanwhile, and written to it
+                temporary.replace(path)
 
 
 def _is_sqlite(path: Path) -> bool:

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING
 from recrl.orchestrator.errors import RecrlError, TrackingError
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.redaction import redacted
-from recrl.orchestrator.tracking.client import EXPERIMENTS, MLFLOW_SETTINGS, connect, one_line, sqlite_path
+from recrl.orchestrator.tracking.client import (
+    EXPERIMENTS,
+    MLFLOW_SETTINGS,
+    connect,
+    mlflow_settings,
+    one_line,
+    sqlite_path,
+)
 from recrl.orchestrator.tracking.export_file import FILE_NAME, FOLDER, UPLOADED_TAG
 
 if TYPE_CHECKING:
@@ -48,9 +55,11 @@ def downloaded_export(uri: str, name: str | None) -> Iterator[Download]:
     Raises:
         TrackingError: MLflow cannot be reached, shows no such sweep, or has no export file of it.
     """
+    settings = MLFLOW_SETTINGS | {"MLFLOW_HTTP_REQUEST_TIMEOUT": str(TIMEOUT_SECONDS)}
     with scratch_folder(tempfile.gettempdir()) as folder:
         try:
-            download = _download(uri, name, folder)
+            with mlflow_settings(settings):  # a user's own later requests to MLflow have the user's settings
+                download = _download(uri, name, folder)
         except RecrlError:
             raise
         except Exception as error:  # MLflow passes on the errors of its database or its server
@@ -62,8 +71,7 @@ def _download(uri: str, name: str | None, folder: Path) -> Download:
     path = sqlite_path(uri)
     if path is not None and not path.exists():
         raise TrackingError(f"{path}: no such file; MLflow would make an empty one")
-    settings = MLFLOW_SETTINGS | {"MLFLOW_HTTP_REQUEST_TIMEOUT": str(TIMEOUT_SECONDS)}
-    client = connect(uri, settings=settings)
+    client = connect(uri)
     parent = _parent(client, uri, name)
     run_id = str(parent.info.run_id)
     sizes = {file.path: file.file_size or 0 for file in client.list_artifacts(run_id, FOLDER)}

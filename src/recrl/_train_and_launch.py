@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 import logging
 import re
 import sys
@@ -16,8 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import numpy as np
-
 from recrl._results import Policy, following, load_sweep, policy_of
 from recrl.environments.plugins import modules_here
 from recrl.orchestrator.errors import NO_PATH, NO_ROOM, GridError, RecrlError, StorageError, described
@@ -29,6 +26,7 @@ from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid, read_grid
 from recrl.orchestrator.launch_grid import LaunchListener, LaunchOptions, launch_grid
 from recrl.orchestrator.launch_plan import Plan
+from recrl.orchestrator.located_yaml import dump
 from recrl.orchestrator.spec import TrialStatus
 
 if TYPE_CHECKING:
@@ -40,8 +38,6 @@ if TYPE_CHECKING:
 Grid: TypeAlias = str | Path | Mapping[str, Any]
 Chosen: TypeAlias = str | Mapping[str, Any]
 SOURCE = "grid"
-NOT_FINITE_OR_TEXT = re.compile(r'"(?:[^"\\]|\\.)*"|Infinity|NaN')
-NOT_ASCII = re.compile(r"[^ -~]")
 LINE_SECONDS = 60.0  # at most between two lines of progress
 
 
@@ -325,34 +321,16 @@ def _checked(grid: Grid, *, build: bool = False) -> GridSpec:
     if isinstance(grid, str | Path):
         return read_grid(Path(grid), build=build)
     try:
-        text = NOT_FINITE_OR_TEXT.sub(_in_yaml, json.dumps(dict(grid), ensure_ascii=False, default=_plain))
-    except (TypeError, ValueError) as error:
+        data = dump(grid)
+    except TypeError as error:
         raise GridError(
             [f"{SOURCE}: must hold plain values only, and code by its import path, my_module:MyTask: {error}"]
         ) from error
-    # JSON would write a character beyond U+FFFF as two escapes, which are two characters in YAML
-    data = NOT_ASCII.sub(lambda found: f"\\U{ord(found[0]):08x}", text).encode()
     try:
         return parse_grid(data, source=SOURCE, build=build)
     except GridError as error:
         problems = [re.sub(rf"^{SOURCE}:\d+: ", "", problem) for problem in error.problems]
         raise GridError(problems) from error
-
-
-def _plain(value: Any) -> Any:
-    """Return a scalar or an array of NumPy's as plain values.
-
-    Raises:
-        TypeError: it is something else.
-    """
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    raise TypeError(f"Object of type {type(value).__name__} is not JSON serializable")
-
-
-def _in_yaml(token: re.Match[str]) -> str:
-    """Return a number of JSON that is not finite as YAML writes it, and a string as it is."""
-    return {"Infinity": ".inf", "NaN": ".nan"}.get(token[0], token[0])
 
 
 class _LineInPlace(logging.Handler):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import calendar
+import os
 import shutil
 import socket
 import time
@@ -22,7 +23,7 @@ from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.tracking import export_file
-from recrl.orchestrator.tracking.client import connect, tracking_uri
+from recrl.orchestrator.tracking.client import MLFLOW_SETTINGS, connect, tracking_uri
 from recrl.orchestrator.tracking.export_file import ExportUpload, write_in_own_process
 from recrl.orchestrator.tracking.mlflow_runs import SweepRuns
 from recrl.orchestrator.tracking.mlflow_sync import Tracker, sync
@@ -112,6 +113,17 @@ def test_a_database_gives_the_sweep_and_says_what_is_missing(sweep: SweepStore, 
 
 def test_the_python_api_takes_an_address(sweep: SweepStore, exported: Sweep) -> None:
     same(recrl.load_sweep(tracking_uri(sweep, None), sweep.name), exported)
+
+
+def test_afterwards_mlflow_has_the_settings_of_the_user(
+    sweep: SweepStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for key in MLFLOW_SETTINGS:
+        monkeypatch.delenv(key, raising=False)
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "7")
+    before = dict(os.environ)
+    from_mlflow.load(tracking_uri(sweep, None), sweep.name)
+    assert dict(os.environ) == before
 
 
 @pytest.mark.usefixtures("server")

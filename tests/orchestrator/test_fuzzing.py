@@ -10,6 +10,7 @@ import os
 import struct
 from typing import Any
 
+import pytest
 import yaml
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
@@ -18,6 +19,7 @@ from recrl.orchestrator.errors import CheckpointError, GridError
 from recrl.orchestrator.files.checkpoint_format import MAGIC, decode, encode
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid
+from recrl.orchestrator.located_yaml import dump, parse
 
 EXAMPLES = int(os.environ.get("RECRL_FUZZ_EXAMPLES", "60"))
 FUZZED = settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck), print_blob=True)
@@ -109,6 +111,27 @@ def test_any_value_at_any_place_of_a_grid_is_taken_or_refused(data: st.DataObjec
     for _ in range(data.draw(st.integers(1, 2))):
         tree = put(tree, data.draw(st.sampled_from(places(tree))), data.draw(values))
     assert_grid_or_error(yaml.safe_dump(tree, allow_unicode=True).encode("utf-8", "surrogatepass"))
+
+
+@given(st.dictionaries(st.text(max_size=150), values, min_size=1))
+@FUZZED
+def test_any_plain_values_are_read_as_they_were_written(tree: dict[str, Any]) -> None:
+    document = parse(dump(tree))
+    assert document.problems == ()
+    assert repr(document.value) == repr(tree)  # NaN is not equal to itself
+
+
+@pytest.mark.parametrize("value", [{1}, b"x", object(), print])
+def test_other_values_are_not_written(value: object) -> None:
+    with pytest.raises(TypeError, match="cannot represent an object"):
+        dump({"a": [value]})
+
+
+def test_a_value_in_itself_is_not_written() -> None:
+    endless: dict[str, Any] = {}
+    endless["a"] = endless
+    with pytest.raises(TypeError, match="a value contains itself"):
+        dump(endless)
 
 
 @given(st.data())

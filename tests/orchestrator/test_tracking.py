@@ -98,6 +98,15 @@ def test_a_database_that_another_process_made_first_is_kept(
     assert {it.name for it in tmp_path.iterdir()} == {"mlflow.db", ".mlflow.db.lock"}
 
 
+def test_what_a_killed_process_left_of_a_database_is_removed(tmp_path: Path) -> None:
+    left = tmp_path / ".mlflow.db-0123abcd"
+    left.mkdir()
+    (left / "recrl-scratch.lock").touch()
+    (left / "mlflow.db").write_bytes(b"half of the tables")
+    client.connect(f"sqlite:///{tmp_path}/mlflow.db")
+    assert {it.name for it in tmp_path.iterdir()} == {"mlflow.db", ".mlflow.db.lock"}
+
+
 def test_a_full_disk_ends_a_pass_and_not_the_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
