@@ -1,4 +1,4 @@
-"""Errors that a user can understand, one class per question; only ``cli`` turns them into exit codes."""
+"""Errors that a user can understand, one class per question; ``cli`` turns them into exit codes."""
 
 from __future__ import annotations
 

@@ -223,8 +223,8 @@ class MeanCost:
         life table. Until an episode has finished these are lower bounds: steps of later ages are not known.
         The table's standard error is that of a mean of as many episodes as it has steps of each age.
 
-        The table never forgets old steps wholly. So the mean of a cost is 0 exactly if no episode of the
-        window and no running one has it.
+        The table never wholly forgets old steps of ages that fewer than ``window`` steps of a rollout have.
+        So the mean of a cost is 0 exactly if no episode of the window and no running one has it.
 
         Args:
             rollout: the steps.

@@ -49,7 +49,7 @@ def cumulative_bounds(sweep: Sweep, agent: str, *, cost: int = 0) -> Figure | No
     trials = trials[(trials["agent"] == agent) & trials[f"deploy_limit_{cost}"].notna()]
     if not len(trials):
         return None
-    look = styles.method_styles(list(sweep.trials["method"].cat.categories))
+    look = styles.styles_of(sweep)
     tasks = occurring(trials["task"])
     methods = [method for method in look if (trials["method"] == method).any()]
     runs = training_runs(sweep)

@@ -59,7 +59,7 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
     )
     shown_steps = ShownSteps.of(trials)
     edges = shown_steps.grid(BINS)
-    look = styles.method_styles(list(sweep.trials["method"].cat.categories))
+    look = styles.styles_of(sweep)
     methods = [method for method in look if (updates["method"] == method).any()]
     quantities = (
         f"cost_{cost}",

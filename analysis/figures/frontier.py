@@ -50,7 +50,7 @@ def return_against_cost(sweep: Sweep) -> Figure | None:
     rows = rows[rows["measure"] == Measure.STOCHASTIC.value]
     if not len(rows):
         return None
-    look = styles.method_styles(list(sweep.trials["method"].cat.categories))
+    look = styles.styles_of(sweep)
     agents = occurring(rows["agent"])
     cells = _cells(sweep, rows)
     clipped = known = False

@@ -48,7 +48,7 @@ def learning_curves(sweep: Sweep, agent: str, *, averaging: CurveAverage = MEAN)
     updates = sweep.updates[sweep.updates["agent"] == agent]
     tasks = occurring(updates["task"])
     num_costs = int(trials["num_costs"].max())
-    look = styles.method_styles(list(sweep.trials["method"].cat.categories))
+    look = styles.styles_of(sweep)
     columns = 2 + 2 * num_costs
     suffixes = [cost_suffix(sweep, i) for i in range(num_costs)]
     with styles.context():
@@ -89,7 +89,7 @@ def curricula(sweep: Sweep) -> Figure:
         sweep: with at least one update.
     """
     updates = sweep.updates
-    look = styles.method_styles(list(sweep.trials["method"].cat.categories))
+    look = styles.styles_of(sweep)
     agents = occurring(updates["agent"])
     cells = [
         (task, i)

@@ -40,7 +40,7 @@ def performance_profiles(sweep: Sweep, measure: Measure) -> Figure | None:
     if not len(rows):
         return None
     failed = sweep.trials[sweep.trials["status"] == TrialStatus.FAILED.value]
-    look = styles.method_styles(list(sweep.trials["method"].cat.categories))
+    look = styles.styles_of(sweep)
     ended = pd.concat([rows[["task", "agent"]], failed[["task", "agent"]]])
     tasks, agents = occurring(ended["task"]), occurring(ended["agent"])
     drawn = set()

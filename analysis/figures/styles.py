@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -23,6 +23,9 @@ from matplotlib.text import Text
 
 from recrl.analysis.data.labels import METHOD_ORDER, ordered
 from recrl.orchestrator.files.atomic_files import write_atomically
+
+if TYPE_CHECKING:
+    from recrl.analysis.data.sweep_data import Sweep
 
 # Formulas in figures: ours, and matplotlib's for numbers on an axis.
 OUR_FORMULAS = re.compile(r"\$(?:d_d|J\^\*\(d(?:_d)?\)|\\mathdefault\{[^$]*\})\$")
@@ -88,6 +91,11 @@ def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
     spare = [method for method in ordered(methods, METHOD_ORDER) if method not in STYLES]
     taken = {method: _spare_style(index) for index, method in enumerate(spare)}
     return {method: STYLES.get(method) or taken[method] for method in ordered(methods, METHOD_ORDER)}
+
+
+def styles_of(sweep: Sweep) -> dict[str, MethodStyle]:
+    """Return the style of every method of a sweep."""
+    return method_styles(list(sweep.trials["method"].cat.categories))
 
 
 def _spare_style(index: int) -> MethodStyle:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from recrl.analysis.data.labels import GROUP
+from recrl.analysis.report.table_formats import names_of
 from recrl.analysis.statistics.claims import CLAIMS, Comparison
 from recrl.analysis.statistics.intervals import share_text
 from recrl.environments.cmdp import Phase
@@ -91,9 +92,8 @@ def bound_table(rows: pd.DataFrame) -> pd.DataFrame:
     """
     known = [(title, name) for title, name in BOUND_COLUMNS.items() if rows[name].notna().any()]
     lines = []
-    for group, runs in rows.groupby(list(GROUP), observed=True, sort=False):
-        line = dict(zip(("task", "agent", "curriculum"), map(str, group), strict=True))
-        line |= {"n": str(len(runs)), "policies": str(int(runs["policies"].iloc[0]))}
+    for _, runs in rows.groupby(list(GROUP), observed=True, sort=False):
+        line = names_of(runs.iloc[0]) | {"n": str(len(runs)), "policies": str(int(runs["policies"].iloc[0]))}
         line["episodes per policy"] = number(float(runs["episodes_per_policy"].mean()))
         for title, name in (*SUM_COLUMNS.items(), *known):
             line[title] = number(float(runs[name].mean()))
@@ -107,7 +107,7 @@ def admissible_table(rows: pd.DataFrame) -> pd.DataFrame:
     for _, row in rows.iterrows():
         limit = float(row["largest_train_limit"])
         lines.append(
-            dict(zip(("task", "agent", "curriculum"), (str(row[name]) for name in GROUP), strict=True))
+            names_of(row)
             | {"episodes per policy": number(row["episodes_per_policy"])}
             | {"overshoot per policy": number(row["overshoot"])}
             | {"net above d_d, worst run": number(row["measured_over_deploy"])}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pandas as pd
 
-from recrl.analysis.report.table_formats import with_interval
+from recrl.analysis.report.table_formats import names_of, with_interval
 from recrl.analysis.statistics.verdicts import costs_of, is_cost
 from recrl.orchestrator.files.outcomes_file import FEASIBLE, INFEASIBLE, SOLVED
 from recrl.orchestrator.number_texts import DASH, number, with_error
@@ -34,8 +34,7 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
     warned = bool(verdicts[list(WARNINGS)].to_numpy().any())
     lines = []
     for _, row in verdicts.iterrows():
-        line = {"task": str(row["task"]), "agent": str(row["agent"]), "curriculum": str(row["method"])}
-        line["verdict"] = verdict_text(row)
+        line = names_of(row) | {"verdict": verdict_text(row)}
         if warned:
             line["warning"] = warning_text(row)
         for name in costs:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from recrl.environments.plugins import modules_here, refuse_import_paths
-from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.errors import TRUST_HINT, RecrlError
 from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 
 NO_POLICIES = "an export and MLflow hold no policies; load the sweep from the folder it ran in"
@@ -180,9 +180,9 @@ def following(trust: bool) -> Iterator[None]:
         with modules_here() if trust else refuse_import_paths():
             yield
     except RecrlError as error:
-        if "add --trust" not in str(error):
+        if TRUST_HINT not in str(error):
             raise
-        raise RecrlError(str(error).replace("add --trust", "pass trust=True")) from error
+        raise RecrlError(str(error).replace(TRUST_HINT, "if you trust it, pass trust=True")) from error
 
 
 @dataclass(eq=False, repr=False)

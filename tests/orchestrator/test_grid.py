@@ -239,8 +239,17 @@ def test_a_curriculum_of_ones_own_declares_what_does_not_go_with_a_cvar(
 
 
 def test_cooling_cannot_relax_limits_of_0() -> None:
-    (problem,) = _problems(SMALL.replace("linear", "cooling").replace("limits: 2", "limits: 0"))
-    assert problem.startswith("grid.yaml:4: methods.1: cooling relaxes a limit in proportion to it, ")
+    cooling = SMALL.replace("linear", "cooling")
+    (problem,) = _problems(cooling.replace("limits: 2", "limits: 0"))
+    assert problem == (
+        "grid.yaml:4: methods.1: cooling relaxes a limit in proportion to it, so it never relaxes the "
+        "deploy_limits of 0 of wear in two-state; use another method, deploy_limits above 0, or "
+        "train_limits of 0"
+    )
+    two = cooling.replace("two-state, ", "two-state-2, ")
+    (problem,) = _problems(two.replace("limits: 2", "limits: [2, 0]"))
+    assert "so it never relaxes the deploy_limits of 0 of noise in two-state-2; use" in problem
+    assert len(_grid(two.replace("limits: 2", "limits: [2, 0], train_limits: [4, 0]")).trials()) == 4
 
 
 def test_cooling_needs_discrete_actions() -> None:
