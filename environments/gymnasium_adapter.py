@@ -320,6 +320,12 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             costs = reported.astype(np.float64, casting="same_kind").reshape(-1)  # refuses text
         except (TypeError, ValueError):
             costs = np.empty(0)
+        if len(costs) > 1 and len(costs) != self.cmdp.num_costs:
+            raise ValueError(
+                f"{self.cmdp.name}: info['cost'] has {len(costs)} numbers, so the environment's attribute "
+                f"cost_names must have {len(costs)} names, got {', '.join(self.cmdp.cost_names)} "
+                "(default: cost)"
+            )
         if costs.shape != (self.cmdp.num_costs,) or not np.isfinite(costs).all():
             raise ValueError(
                 f"{self.cmdp.name}: info['cost'] must be a finite number for each of "

@@ -1,4 +1,4 @@
-"""Merge parts of a sweep that ran in several places.
+"""Merge parts of a sweep that ran in several places; take a part of a sweep.
 
 A grid's trials may be divided with ``launch --only``, or a sweep may continue without the folder of its first
 trials. Each place makes an export (``recrl.analysis.data.export``); here they are joined. Trials are the same
@@ -7,7 +7,8 @@ if their specs are, independent of the parts' names.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -16,7 +17,7 @@ import pandas as pd
 from recrl.analysis.data.labels import TRIAL, listed
 from recrl.analysis.data.sweep_data import ROWS, Sweep, TrialFacts, assemble
 from recrl.orchestrator.errors import RecrlError
-from recrl.orchestrator.spec import TrialStatus
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 
 OUTCOMES = ("phases", "evaluations")  # data frames that every source has unrounded
 NAMED = 3  # largest number of trials in a note
@@ -57,12 +58,35 @@ def merge(parts: Sequence[Sweep], *, finished_only: bool = False) -> Sweep:
     notes = [note for part in parts for note in part.notes]
     if len({part.grid for part in parts if part.grid}) > 1:
         notes.append("the parts have different grid files; the first part's is kept")
+    return _assembled(parts, taken, notes=[*notes, *_disagreements(parts, having)])
+
+
+def part_of(sweep: Sweep, specs: Iterable[TrialSpec]) -> Sweep:
+    """Return a sweep with only some of its trials.
+
+    Args:
+        sweep: has all of them.
+        specs: of the trials.
+    """
+    part = _assembled([sweep], {spec.trial_id: 0 for spec in specs}, notes=sweep.notes)
+    return replace(part, folder=sweep.folder)
+
+
+def _assembled(parts: Sequence[Sweep], taken: Mapping[str, int], *, notes: Sequence[str]) -> Sweep:
+    """Return a sweep of some trials.
+
+    Args:
+        parts: the first gives the name.
+        taken: the position of the part that each trial is taken from, by the trial's id.
+        notes: of the sweep.
+    """
+    facts = [{trial.spec.trial_id: trial for trial in part.facts} for part in parts]
     return assemble(
         parts[0].name,
-        [trials[number][trial_id] for trial_id, number in taken.items()],
+        [facts[number][trial_id] for trial_id, number in taken.items()],
         {name: _taken(parts, name, taken) for name in ROWS},
         grid=next((part.grid for part in parts if part.grid), ""),
-        notes=[*notes, *_disagreements(parts, having)],
+        notes=notes,
     )
 
 

@@ -40,7 +40,7 @@ CORRECTED_NOTE = (
     f"{table_formats.CORRECTED}: of a paired t test, corrected by Holm's method for all rows of two or more "
     "seeds, also those with a dash. It is 1 if all pairs tie."
 )
-LATEX_NOTE = "n: seeds; +-: one standard error over seeds; in brackets: 95% intervals."
+LATEX_NOTE = "n: seeds; +-: one standard error over seeds; in parentheses or brackets: 95% intervals."
 FEW = f"{table_formats.TOO_FEW}: with fewer than {ENOUGH_RUNS} seeds this interval is too short."
 SUMS_NOTE = (
     "Sums over the policies of the training phase, one expected episode each; means over n seeds. A policy "

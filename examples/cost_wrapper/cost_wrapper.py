@@ -1,6 +1,7 @@
 """Existing environments as tasks: wrappers that put a cost into ``info["cost"]``."""
 
 import gymnasium
+import numpy as np
 
 
 class FarFromMiddle(gymnasium.Wrapper):
@@ -21,6 +22,23 @@ class FarFromMiddle(gymnasium.Wrapper):
 def pole(distance=0.5, render_mode=None):
     """Return one environment. Its keywords are the options of the task in the grid file."""
     return FarFromMiddle(gymnasium.make("CartPole-v1", render_mode=render_mode), distance)
+
+
+class FarOrTilted(gymnasium.Wrapper):
+    """CartPole with two costs: of a step far from the middle, and the angle of the pole in radians."""
+
+    cost_names = ("far", "tilted")
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        position, _, angle, _ = observation
+        costs = np.array([abs(position) > 0.5, abs(angle)], np.float64)
+        return observation, reward, terminated, truncated, {**info, "cost": costs}
+
+
+def pole_of_two_costs(render_mode=None):
+    """Return one environment with two costs."""
+    return FarOrTilted(gymnasium.make("CartPole-v1", render_mode=render_mode))
 
 
 class SeparateCost(gymnasium.Wrapper):

@@ -245,6 +245,7 @@ class SourceRequest(SweepRequest):
     sweep: str | None = by_place(
         nargs="?", metavar="SWEEP", help=f"{SWEEP_HELP}; or a file that export wrote (.zip)"
     )
+    only: tuple[str, ...] = by_flag(**_ONLY)
     tracking_uri: str | None = by_flag(
         metavar="URI",
         help="read MLflow instead of files: a server (http://host:port) or database (sqlite:///file.db)",

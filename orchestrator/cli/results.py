@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import DamagedError, RecrlError, described
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid.checking import read_name
+from recrl.orchestrator.grid.only_selection import parse_only, select
 from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.tracking.client import checked_uri
 
@@ -23,7 +25,12 @@ if TYPE_CHECKING:
 
 def run_figures(request: FiguresRequest, console: Console) -> ExitCode:
     """Draw the figures and tables of a sweep in its folder, an export or MLflow."""
+    _require_place_of_part(request)
     sweep, folder = source(request)
+    if request.only:
+        shown = " ".join(request.only)
+        note = f"only trials with {shown} are here, and p is corrected for the comparisons of these only"
+        sweep = replace(sweep, notes=(*sweep.notes, note))
     say_warnings(sweep, console)
     require_undamaged(sweep)
     folder = request.to or folder
@@ -45,6 +52,7 @@ def run_export(request: ExportRequest, console: Console) -> ExitCode:
     """Write the compact file of a sweep."""
     from recrl.analysis.data import export  # noqa: PLC0415  (imports pandas)
 
+    _require_place_of_part(request)
     sweep, _ = source(request)
     _say_file(export.save(sweep, request.to or Path(f"{sweep.name}{export.SUFFIX}")), sweep, console)
     say_warnings(sweep, console)
@@ -86,6 +94,16 @@ def require_undamaged(sweep: Sweep) -> None:
         raise DamagedError(f"{sweep.name}: all trials are damaged")
 
 
+def _require_place_of_part(request: FiguresRequest | ExportRequest) -> None:
+    """Check that what has only some trials does not replace what has all.
+
+    Raises:
+        RecrlError: it would.
+    """
+    if request.only and request.to is None:
+        raise RecrlError("--only: give --to as well, so that a part does not replace what has all trials")
+
+
 def _say_file(path: Path, sweep: Sweep, console: Console) -> None:
     complete = sum(trial.status is TrialStatus.COMPLETE for trial in sweep.facts)
     size = f"{path.stat().st_size / 1000:,.0f} kB"
@@ -93,7 +111,17 @@ def _say_file(path: Path, sweep: Sweep, console: Console) -> None:
 
 
 def source(request: SourceRequest) -> tuple[Sweep, Path]:
-    """Return the sweep, from its files, an export or MLflow, and a folder for figures."""
+    """Return the chosen trials of a sweep, from its files, an export or MLflow, and a folder for figures."""
+    from recrl.analysis.data import merging  # noqa: PLC0415  (imports pandas and SciPy)
+
+    only = parse_only(request.only)
+    sweep, folder = _source_of_all(request)
+    if only:
+        sweep = merging.part_of(sweep, select([trial.spec for trial in sweep.facts], only))
+    return sweep, folder
+
+
+def _source_of_all(request: SourceRequest) -> tuple[Sweep, Path]:
     from recrl.analysis.data import export, from_mlflow, sweep_data  # noqa: PLC0415  (imports pandas and SciPy)
 
     given: str | None = request.sweep

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from recrl.analysis.data import export, sweep_data
-from recrl.analysis.data.merging import merge
+from recrl.analysis.data.merging import merge, part_of
 from recrl.analysis.data.sweep_data import ROWS, Sweep, TrialFacts
 from recrl.analysis.report import drawing
 from recrl.analysis.statistics import metrics
@@ -51,6 +51,14 @@ def assert_equal(one: Sweep, other: Sweep) -> None:
     for name in ("trials", *sweep_data.ROWS):
         left, right = (getattr(it, name).drop(columns="cpu_seconds", errors="ignore") for it in (one, other))
         pd.testing.assert_frame_equal(left, right, check_exact=True)
+
+
+def test_a_part_is_a_sweep_without_the_other_trials(part: Part) -> None:
+    half, whole = part("half", missing=TITLES[1::2]), part("whole")
+    chosen = part_of(whole, [trial.spec for trial in half.facts])
+    assert_equal(chosen, half)
+    assert chosen.folder == whole.folder
+    assert [trial.spec for trial in chosen.facts] == [trial.spec for trial in half.facts]
 
 
 def test_two_halves_are_the_whole(part: Part) -> None:

@@ -249,7 +249,7 @@ def test_another_number_of_costs_than_named_is_refused() -> None:
     environment.reset(seed=0)
     with pytest.raises(
         ValueError,
-        match=r"info\['cost'\] must be a finite number for each of time \(.*cost_names\), got \[1, 2\]",
+        match=r"info\['cost'\] has 2 numbers, so .* cost_names must have 2 names, got time \(default: cost\)",
     ):
         environment.step(np.array([0]))
 

@@ -16,8 +16,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pandas as pd
 import pytest
 
+from recrl.analysis.data import export
 from recrl.analysis.figures import learning_curves
 from recrl.environments.plugins import load_attribute
 from recrl.orchestrator.cli import display, status
@@ -1054,6 +1056,26 @@ def test_an_environment_that_cannot_be_closed_is_no_traceback(
     (folder / "room_closed.py").write_text(code + closing)
     assert main(["validate", "grid.yaml", "--trust"]) == ExitCode.OK
     assert "room_closed:Room raised an error when it was closed: RuntimeError: stuck" in caplog.text
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_a_part_of_a_sweep_is_drawn_and_exported_elsewhere(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    for command in ("figures", "export"):
+        assert main([command, "small", "--only", "method=none"]) == ExitCode.WRONG_INPUT
+    assert capsys.readouterr().err.splitlines() == 2 * [
+        "recrl-sweep: --only: give --to as well, so that a part does not replace what has all trials"
+    ]
+    assert main(["figures", "small", "--sketch", "--only", "method=none", "--to", "part"]) == ExitCode.OK
+    assert not (folder / "runs" / "small" / "figures").exists()
+    assert pd.read_csv(folder / "part" / "verdicts.csv")["method"].tolist() == ["none"]
+    assert "only trials with method=none are here" in (folder / "part" / "report.md").read_text()
+    assert main(["export", "small", "--only", "method=none", "--to", "part.zip"]) == ExitCode.OK
+    assert export.load(Path("part.zip")).trials["method"].tolist() == ["none"]
+    assert main(["bound", "small", "--only", "method=nine"]) == ExitCode.WRONG_INPUT
+    assert "--only: no trial has method 'nine'" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("unrendered")
