@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Mapping
 from typing import Annotated, Any, get_type_hints
 
@@ -30,7 +31,10 @@ def checked_name(value: Any) -> str:
     'demo'
     """
     if not isinstance(value, str) or not _NAME.fullmatch(value) or printable(value) != value:
-        raise ValueError(f"the sweep's name must be a name for a folder, got {as_written(value)}")
+        raise ValueError(
+            "the sweep's name must be a name for a folder that begins with a letter or a digit, "
+            f"got {as_written(value)}"
+        )
     return value
 
 
@@ -43,6 +47,16 @@ def plain_text(text: str) -> str:
     if printable(text) != text or "\n" in text or "\t" in text:
         raise ValueError(f"must hold no control characters, got {text!a}")
     return text
+
+
+def as_seen(text: str) -> str:
+    r"""Return a label as a reader sees it: composed, without invisible characters and spaces at its ends.
+
+    >>> as_seen("none\u200b ") == as_seen("none"), as_seen(" \u200b")
+    (True, '')
+    """
+    visible = "".join(it for it in unicodedata.normalize("NFC", text) if unicodedata.category(it) != "Cf")
+    return " ".join(visible.split())
 
 
 def _limits(values: list[float | str]) -> list[float | str]:

@@ -77,6 +77,8 @@ ul.failed { border-left: 4px solid #c0392b; padding-left: 0.6rem; }
   details { border-top: 0; }
 }
 """
+GENERATOR = '<meta name="generator" content="recrl">'  # in the first HEAD_BYTES of every page
+HEAD_BYTES = 1000
 NAMES = ("task", "agent", "curriculum")
 HYPHENATED = re.compile(r"(?<!\S)(?=\S{1,30}(?!\S))(?:--)?\w+(?:-\w+)+")  # ppo-lag stays on one line
 
@@ -125,7 +127,7 @@ def page(
     return "\n".join(
         [
             '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f'<meta name="viewport" content="width=device-width, initial-scale=1">\n{GENERATOR}',
             f'<link rel="icon" href="data:,">{reload}',
             f"<title>{escape(title)}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>",
             f"<h1>{escape(title)}</h1>\n"
@@ -135,6 +137,15 @@ def page(
             "</body>\n</html>",
         ]
     )
+
+
+def is_ours(page: Path) -> bool:
+    """Return whether a file is a page that recrl wrote."""
+    try:
+        with page.open("rb") as file:
+            return GENERATOR.encode() in file.read(HEAD_BYTES)
+    except OSError:
+        return False
 
 
 def figure(png: Path, caption: str, file: str) -> str:

@@ -13,7 +13,7 @@ from recrl.analysis.data.cost_names import cost_names, cost_suffix
 from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.data.sweep_warnings import curriculum_flags
-from recrl.analysis.report import table_formats
+from recrl.analysis.report import html_page, table_formats
 from recrl.analysis.report.text_tables import bound_table, claims_table
 from recrl.analysis.report.verdict_terms import tolerance_sentence
 from recrl.analysis.statistics import claims, metrics
@@ -164,9 +164,9 @@ def write_tables(sweep: Sweep, folder: Path) -> tuple[list[Path], Tables]:
 def _remove_earlier(folder: Path, written: Sequence[Path]) -> None:
     """Remove tables of an earlier grid that were not written again, beside an earlier report.
 
-    They can always be computed. In a folder without a report a file of such a name may be the user's.
+    They can always be computed. Without a report of recrl's a file of such a name may be the user's.
     """
-    if not (folder / "report.html").exists():
+    if not html_page.is_ours(folder / "report.html"):
         return
     for name in {*CONDITIONAL_TABLES} - {path.name for path in written}:
         (folder / name).unlink(missing_ok=True)

@@ -134,8 +134,8 @@ def replay_summary(trial: TrialReader, rows: pd.DataFrame) -> pd.DataFrame:
             {"trial": trial.spec.title, "cost": str(i), "updates": str(len(training))}
             | {"other limit": str(int(differ.sum()))}
             | {"mean limit": _mean(own), "replayed": _mean(other)}
-            | {"reaches d_d": _reached(training, own, deploy)}
-            | {"replayed reaches d_d": _reached(training, other, deploy)}
+            | {"reaches d_d": _reached(training, own, deploy, train_steps=trial.spec.train_steps)}
+            | {"replayed reaches d_d": _reached(training, other, deploy, train_steps=trial.spec.train_steps)}
             | {
                 "noise": str(_times(training["noise"])),
                 "replayed noise": str(_times(training["replayed_noise"])),
@@ -150,10 +150,12 @@ def _mean(limits: Sequence[float] | np.ndarray) -> str:
     return number(float(finite.mean())) if len(finite) else "∞"
 
 
-def _reached(training: pd.DataFrame, limits: np.ndarray, deploy: float) -> str:
+def _reached(training: pd.DataFrame, limits: np.ndarray, deploy: float, *, train_steps: int) -> str:
     """Return when a limit first equals d_d, as a percentage of the training phase."""
     begins = training["end_step"].shift(fill_value=0)[limits <= deploy]
-    return f"{begins.iloc[0] / training['end_step'].iloc[-1]:.0%}" if len(begins) else "at its end"
+    if len(begins):
+        return f"{begins.iloc[0] / train_steps:.0%}"
+    return "at its end" if training["end_step"].iloc[-1] >= train_steps else "not yet"
 
 
 def _times(noise: pd.Series) -> str:

@@ -34,15 +34,16 @@ def folder(text: str) -> Path:
     return path
 
 
-def address(text: str) -> str:
-    """An address: any text but an empty one, which an unset variable of a shell leaves."""
+def not_empty(text: str) -> str:
+    """Any text but an empty one, which an unset variable of a shell leaves."""
     if not text.strip():
         raise argparse.ArgumentTypeError("must not be empty; leave it out, or check the shell's variable")
     return text
 
 
 def path_of(text: str) -> Path:
-    """A path that the system accepts."""
+    """A path that the system accepts, and that is not empty."""
+    not_empty(text)
     if "\0" in text:
         raise argparse.ArgumentTypeError("must hold no NUL character")
     return Path(text)

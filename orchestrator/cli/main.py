@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from recrl.orchestrator.cli.argument_fields import Request
 from recrl.orchestrator.cli.arguments import COMMANDS, parse, readable
-from recrl.orchestrator.cli.requests import LaunchRequest
+from recrl.orchestrator.cli.requests import LaunchRequest, LogsRequest
 from recrl.orchestrator.errors import (
     NO_PATH,
     NO_ROOM,
@@ -79,7 +79,9 @@ def _run(request: Request) -> ExitCode:
     from recrl.orchestrator.cli.output import TextConsole, logging_to_stderr  # noqa: PLC0415
 
     # a file or a pipe has no width that tables must fit
-    console = TextConsole() if sys.stdout.isatty() else TextConsole(width=160)
+    console = TextConsole(
+        width=None if sys.stdout.isatty() else 160, ends_with_reader=isinstance(request, LogsRequest)
+    )
     followed = modules_in(Path.cwd()) if request.follows_import_paths else refuse_import_paths()
     try:
         with logging_to_stderr(), followed:

@@ -59,7 +59,7 @@ class PlaceRequest(Request):
         help=f"the folder of all sweeps (default: {DEFAULT_ROOT})",
     )
     storage: str | None = by_flag(
-        type=types.address, metavar="URI", help=f"read the sweep from {_STORE}; {_COPY}"
+        type=types.not_empty, metavar="URI", help=f"read the sweep from {_STORE}; {_COPY}"
     )
 
 
@@ -97,10 +97,10 @@ class LaunchRequest(GridRequest):
     example: ClassVar[str] = "recrl-sweep launch demo.yaml --only method=none,dynamic seed=0"
     trusted: ClassVar[bool] = True
     storage: str | None = by_flag(
-        type=types.address, metavar="URI", help=f"keep the sweep in {_STORE} for all nodes; {_COPY}"
+        type=types.not_empty, metavar="URI", help=f"keep the sweep in {_STORE} for all nodes; {_COPY}"
     )
     address: str | None = by_flag(
-        type=types.address,
+        type=types.not_empty,
         metavar="HOST:PORT",
         help="an existing Ray cluster that this machine is a node of, or 'auto' to find it; by default one "
         "is started here",
@@ -129,7 +129,7 @@ class PlanRequest(GridRequest):
     example: ClassVar[str] = "recrl-sweep plan demo.yaml --measure"
     address: str | None = by_flag(
         group="room",
-        type=types.address,
+        type=types.not_empty,
         metavar="HOST:PORT",
         help="estimate for this Ray cluster, which must run, or 'auto' to find it; by default for this "
         "machine",
@@ -169,7 +169,9 @@ class StatusRequest(SweepRequest):
     """Show the progress of a sweep, from its files."""
 
     example: ClassVar[str] = "recrl-sweep status demo"
-    brief: bool = by_flag(action="store_true", help="one line, without the table of trials")
+    brief: bool = by_flag(
+        action="store_true", help="without the table of trials: one line, and what is wrong"
+    )
 
 
 class CheckRequest(SweepRequest):

@@ -43,6 +43,7 @@ from recrl.orchestrator.grid.file_models import Entry, GridFile, Limits, Run, Sw
 from recrl.orchestrator.grid.problem_list import TASK_MARK, ProblemList
 from recrl.orchestrator.located_yaml import Place, Problem, parse
 from recrl.orchestrator.spec import Choice, TrialSpec
+from recrl.orchestrator.untrusted import as_seen
 from recrl.orchestrator.validation_sentences import (
     NotJsonError,
     as_written,
@@ -299,7 +300,7 @@ class _Check:
     def _check_differs(self, place: Place, choice: Choice, earlier: Mapping[int, Choice]) -> None:
         """Check that no earlier entry has the same label, or is the same under another label."""
         for index, other in earlier.items():
-            if other.label == choice.label:
+            if as_seen(other.label) == as_seen(choice.label):
                 self.problems.add(
                     place, f"is called {choice.label!r}, as is {place[0]}.{index}; give it another label"
                 )

@@ -25,7 +25,7 @@ from pydantic import (
 )
 
 from recrl.orchestrator.spec import TrialSpec
-from recrl.orchestrator.untrusted import PlainText, ShortText
+from recrl.orchestrator.untrusted import PlainText, ShortText, as_seen
 from recrl.orchestrator.validation_sentences import as_written
 
 REQUIRED = "required"
@@ -129,6 +129,12 @@ def _read_name(value: Any) -> str:
     return value
 
 
+def _read_label(text: str) -> str:
+    if text and (text != text.strip() or not as_seen(text)):
+        raise ValueError(f"must be visible text without spaces at its ends, got {text!a}")
+    return text
+
+
 def _one_or_list(value: Mapping[str, Any], **others: Any) -> WithJsonSchema:
     """Return the JSON schema of a value, of a list of such values, or of another type."""
     listed = {"type": "array", "items": value, "minItems": 1}
@@ -155,6 +161,7 @@ Seeds = Annotated[
     tuple[int, ...], PlainValidator(_read_seeds), _one_or_list({"type": "integer", "minimum": 0})
 ]
 _AT_LEAST_ONE = Field(min_length=1)
+Label = Annotated[PlainText, AfterValidator(_read_label)]
 Labels = Annotated[list[str], BeforeValidator(_listed), _AT_LEAST_ONE, _one_or_list(_TEXT)]
 CustomResources = Annotated[
     dict[str, float],
@@ -182,7 +189,7 @@ class Entry(_Written):
     """An agent or a method: its name, or a mapping."""
 
     name: ShortText = Field(description="Registry name, entry point or package.module:attribute.")
-    label: PlainText = Field(
+    label: Label = Field(
         default="", max_length=60, description="Label in tables and figures; by default the name."
     )
     options: dict[str, Any] = Field(

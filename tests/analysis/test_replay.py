@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from recrl.analysis.figures.curriculum_replay import Replayed, replayed_limits
@@ -87,6 +88,21 @@ def test_another_teacher_sets_its_limits_on_the_same_episodes(trial: TrialStore)
     (line,) = replay_summary(trial, rows).to_dict("records")
     assert (line["cost"], line["replayed"], line["replayed reaches d_d"]) == ("0", "1.00", "0%")
     assert line["other limit"] == str((rows["limit_0"].iloc[:37] != 1.0).sum())
+
+
+def test_when_the_limit_arrives_is_a_share_of_the_whole_training_phase(trial: TrialStore) -> None:
+    def arrival(rows: pd.DataFrame) -> str:
+        (line,) = replay_summary(trial, rows).to_dict("records")
+        return str(line["reaches d_d"])
+
+    rows = replay(trial, SPEC.method)
+    limits = np.full(len(rows), 2.0)
+    limits[18:] = 1.0
+    rows["limit_0"] = limits
+    assert arrival(rows) == arrival(rows.iloc[:20]) == f"{18 * 60 / SPEC.train_steps:.0%}" == "49%"
+    assert arrival(rows.iloc[:10]) == "not yet"
+    rows["limit_0"] = 2.0
+    assert arrival(rows) == "at its end"
 
 
 def test_a_run_without_updates_cannot_be_replayed(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from recrl.analysis.data import sweep_data
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures import learning_curves
-from recrl.analysis.report import drawing, figure_list, table_files
+from recrl.analysis.report import drawing, figure_list, html_page, table_files
 from recrl.analysis.report.figure_list import NothingToDrawError
 from recrl.analysis.report.verdict_answers import no_verdict
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -178,9 +178,11 @@ def test_no_table_or_figure_of_an_earlier_grid_stays_beside_a_new_report(
     for name in (*stale, "return-against-cost.png", "mine.csv"):
         (tmp_path / name).write_text("old")
     running = dataclasses.replace(finished, trials=finished.trials.assign(status="running"))
-    table_files.write_tables(running, tmp_path)  # no report is here: they may be somebody's own
-    assert all((tmp_path / name).read_text() == "old" for name in stale)
-    (tmp_path / "report.html").write_text("old")
+    for report in ("mine.html", "report.html"):  # no report of recrl's is here: they may be somebody's own
+        (tmp_path / report).write_text("<html>somebody's own</html>")
+        table_files.write_tables(running, tmp_path)
+        assert all((tmp_path / name).read_text() == "old" for name in stale)
+    (tmp_path / "report.html").write_text(html_page.page("an earlier one", "", []))
     drawing.sketch(running, tmp_path)
     assert [name for name in stale if (tmp_path / name).exists()] == []
     assert not (tmp_path / "return-against-cost.png").exists()

@@ -382,18 +382,28 @@ def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(folder: Path) -> None:
     assert not any(trial.record().status.is_finished for trial in store.trials())
 
 
-def test_a_closed_pipe_ends_a_command_quietly(folder: Path) -> None:
-    """``recrl-sweep list tasks | head -1``: the reader is gone before anything is written."""
-    code = """
+def test_a_closed_pipe_ends_no_command_and_changes_no_exit_code(folder: Path) -> None:
+    """``recrl-sweep launch grid.yaml | head -1``: the reader is gone before anything is written."""
+
+    def without_reader(*arguments: str) -> tuple[int, str]:
+        code = f"""
 import os, sys
 from recrl.orchestrator.cli.main import main
 reader, writer = os.pipe()
 os.dup2(writer, 1)
 os.close(reader)
-sys.exit(main(["list", "tasks"]))
+sys.exit(main({list(arguments)}))
 """
-    done = _python(code, folder)
-    assert (done.returncode, done.stderr) == (ExitCode.OK, "")
+        done = _python(code, folder)
+        return done.returncode, done.stderr
+
+    assert without_reader("list", "tasks") == (ExitCode.OK, "")
+    assert without_reader("launch", "grid.yaml", *INLINE) == (ExitCode.OK, "")
+    store = SweepStore(folder / "runs", "small")
+    assert all(trial.record().status is TrialStatus.COMPLETE for trial in store.trials())
+    assert without_reader("logs", "small", store.trials()[0].trial_id) == (ExitCode.OK, "")
+    store.trials()[0].episodes_path.write_text("cut")
+    assert without_reader("check", "small") == (ExitCode.TRIALS_FAILED, "")
 
 
 def test_a_terminal_without_a_sign_shows_another(folder: Path) -> None:
@@ -564,6 +574,8 @@ EMPTY = "must not be empty; leave it out, or check the shell's variable"
     [
         (["launch", "grid.yaml", "--storage", ""], f"argument --storage: {EMPTY}"),
         (["launch", "grid.yaml", "--address="], f"argument --address: {EMPTY}"),
+        (["launch", "grid.yaml", "--root", ""], f"argument --root: {EMPTY}"),
+        (["figures", "small", "--to", " "], f"argument --to: {EMPTY}"),
         (["logs", "--follow", "--folder"], "argument --folder: not allowed with argument --follow"),
     ],
 )

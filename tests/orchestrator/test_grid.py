@@ -128,6 +128,25 @@ def test_a_misspelt_key_is_one_mistake(old: str, new: str, problem: str) -> None
 
 
 @pytest.mark.parametrize(
+    ("label", "problem"),
+    [
+        (r"none\u200b", "methods.1: is called 'none\\u200b', as is methods.0; give it another label"),
+        ("none ", "methods.1.label: must be visible text without spaces at its ends, got 'none '"),
+        (r"\u200b", "methods.1.label: must be visible text without spaces at its ends, got '\\u200b'"),
+    ],
+)
+def test_labels_must_differ_for_a_reader(label: str, problem: str) -> None:
+    methods = f'[none, {{name: linear, label: "{label}"}}]'
+    assert _problems(SMALL.replace("[none, linear]", methods)) == [f"grid.yaml:4: {problem}"]
+
+
+def test_labels_that_are_composed_in_another_way_are_the_same() -> None:
+    methods = r'[{name: none, label: "\u00e9"}, {name: linear, label: "e\u0301"}]'
+    (problem,) = _problems(SMALL.replace("[none, linear]", methods))
+    assert problem.endswith("as is methods.0; give it another label")
+
+
+@pytest.mark.parametrize(
     ("new", "problem"),
     [
         ("nmae: small", "1: nmae: unknown key; did you mean 'name'?"),
