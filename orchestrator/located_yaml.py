@@ -147,6 +147,9 @@ class _Dumper(yaml.SafeDumper):
 _AS_PLAIN: Mapping[type, Callable[[Any, Any], yaml.Node]] = {  # also of subclasses
     dict: yaml.SafeDumper.represent_dict,
     list: yaml.SafeDumper.represent_list,
+    tuple: yaml.SafeDumper.represent_list,
+    int: lambda dumper, number: dumper.represent_int(int(number)),
+    float: lambda dumper, number: dumper.represent_float(float(number)),
     str: lambda dumper, text: dumper.represent_str(str.__str__(text)),
     np.generic: lambda dumper, scalar: dumper.represent_data(scalar.item()),
     np.ndarray: lambda dumper, array: dumper.represent_data(array.tolist()),
@@ -165,8 +168,10 @@ def dump(value: Mapping[str, Any]) -> bytes:
         text = yaml.dump(dict(value), Dumper=_Dumper, sort_keys=False, width=math.inf)
     except yaml.representer.RepresenterError as error:
         raise TypeError(f"{error.args[0]}: {error.args[-1]!r}") from error
+    except ValueError as error:  # a number of thousands of digits, or no dictionary
+        raise TypeError(str(error)) from error
     except RecursionError as error:
-        raise TypeError("a value contains itself") from error
+        raise TypeError("a value contains itself, or is nested too deeply") from error
     return text.encode()
 
 

@@ -50,7 +50,9 @@ def plain_text(text: str) -> str:
 
 
 def as_seen(text: str) -> str:
-    r"""Return a label as a reader sees it: composed, without invisible characters and spaces at its ends.
+    r"""Return a label as a reader sees it: composed, with single spaces, without zero-width characters.
+
+    Left out is Unicode's category Cf, which has most of them.
 
     >>> as_seen("none\u200b ") == as_seen("none"), as_seen(" \u200b")
     (True, '')

@@ -222,8 +222,7 @@ def load(store: SweepStore) -> Sweep:
     Raises:
         DamagedError: the file that lists the trials is damaged.
     """
-    specs, trials = _trials(store)
-    read = [_read(spec, trial) for spec, trial in zip(specs, trials, strict=True)]
+    read = [_read(spec, store.trial(spec)) for spec in store.specs()]
     grid, problem = store.grid_text()
     sweep = assemble(
         store.name,
@@ -254,8 +253,9 @@ def load_episodes(
                 f"{sweep.name}: an export and MLflow hold no single episodes of training; load the sweep "
                 "from the folder it ran in"
             )
-        sweep = SweepStore(sweep.folder.parent, sweep.folder.name)
-    specs, trials = _trials(sweep)
+        store, specs = SweepStore(sweep.folder.parent, sweep.folder.name), [it.spec for it in sweep.facts]
+    else:
+        store, specs = sweep, sweep.specs()
 
     def rows(trial: TrialReader) -> pd.DataFrame:
         try:
@@ -268,7 +268,9 @@ def load_episodes(
         return episodes if columns is None else episodes.reindex(columns=list(columns))
 
     keys, _ = keys_of(specs)
-    return keys.put_before(concatenated([rows(trial) for trial in trials]), columns or EPISODE_COLUMNS)
+    return keys.put_before(
+        concatenated([rows(store.trial(spec)) for spec in specs]), columns or EPISODE_COLUMNS
+    )
 
 
 def assemble(
@@ -373,12 +375,6 @@ def _trial_row(trial: TrialFacts, optimum: float) -> dict[str, Any]:
     ):
         row |= {f"train_limit_{i}": train, f"deploy_limit_{i}": deploy, f"start_limit_{i}": float(measured)}
     return row
-
-
-def _trials(store: SweepStore) -> tuple[list[TrialSpec], list[TrialReader]]:
-    """Return the trials of the sweep's last launch."""
-    specs = store.specs()
-    return specs, [store.trial(spec) for spec in specs]
 
 
 def _read(spec: TrialSpec, trial: TrialReader) -> tuple[TrialFacts, dict[str, pd.DataFrame]]:

@@ -77,8 +77,13 @@ ul.failed { border-left: 4px solid #c0392b; padding-left: 0.6rem; }
   details { border-top: 0; }
 }
 """
-GENERATOR = '<meta name="generator" content="recrl">'  # in the first HEAD_BYTES of every page
-HEAD_BYTES = 1000
+HEAD = """\
+<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<link rel="icon" href="data:,">"""
 NAMES = ("task", "agent", "curriculum")
 HYPHENATED = re.compile(r"(?<!\S)(?=\S{1,30}(?!\S))(?:--)?\w+(?:-\w+)+")  # ppo-lag stays on one line
 
@@ -126,9 +131,7 @@ def page(
     reload = f'<meta http-equiv="refresh" content="{reload_seconds}">' if reload_seconds else ""
     return "\n".join(
         [
-            '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-            f'<meta name="viewport" content="width=device-width, initial-scale=1">\n{GENERATOR}',
-            f'<link rel="icon" href="data:,">{reload}',
+            f"{HEAD}{reload}",
             f"<title>{escape(title)}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>",
             f"<h1>{escape(title)}</h1>\n"
             + (f'<p class="notes">{escape(made)}</p>\n' if made else "")
@@ -140,10 +143,10 @@ def page(
 
 
 def is_ours(page: Path) -> bool:
-    """Return whether a file is a page that recrl wrote."""
+    """Return whether a file begins as the pages that recrl writes."""
     try:
         with page.open("rb") as file:
-            return GENERATOR.encode() in file.read(HEAD_BYTES)
+            return file.read(len(HEAD)) == HEAD.encode()
     except OSError:
         return False
 

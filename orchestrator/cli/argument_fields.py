@@ -39,6 +39,7 @@ class Request:
 
     example: ClassVar[str] = ""  # a command line for --help
     trusted: ClassVar[bool] = False  # whether the command itself is the permission to follow import paths
+    ends_with_reader: ClassVar[bool] = False  # whether a closed pipe ends the command: it does nothing else
     given: tuple[str, ...]
 
     @classmethod

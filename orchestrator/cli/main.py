@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 from recrl.orchestrator.cli.argument_fields import Request
 from recrl.orchestrator.cli.arguments import COMMANDS, parse, readable
-from recrl.orchestrator.cli.requests import LaunchRequest, LogsRequest
+from recrl.orchestrator.cli.lasting_streams import let_streams_last
+from recrl.orchestrator.cli.requests import LaunchRequest
 from recrl.orchestrator.errors import (
     NO_PATH,
     NO_ROOM,
@@ -44,6 +45,7 @@ def main(given: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):  # its encoding may lack a sign such as ±
         sys.stdout.reconfigure(errors="replace")
     request = parse(given)
+    let_streams_last(output=not request.ends_with_reader)
     try:
         return _run(request)
     except GridError as error:
@@ -58,7 +60,7 @@ def main(given: Sequence[str] | None = None) -> int:
         again = "; go on with the same command" if isinstance(request, LaunchRequest) else ""
         print(f"Stopped at once{again}.", file=sys.stderr)
         return ExitCode.STOPPED
-    except BrokenPipeError:  # the reader, for example ``head``, has closed the pipe
+    except BrokenPipeError:  # of a command that ends with its reader
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ExitCode.OK
     except OSError as error:
@@ -79,9 +81,7 @@ def _run(request: Request) -> ExitCode:
     from recrl.orchestrator.cli.output import TextConsole, logging_to_stderr  # noqa: PLC0415
 
     # a file or a pipe has no width that tables must fit
-    console = TextConsole(
-        width=None if sys.stdout.isatty() else 160, ends_with_reader=isinstance(request, LogsRequest)
-    )
+    console = TextConsole() if sys.stdout.isatty() else TextConsole(width=160)
     followed = modules_in(Path.cwd()) if request.follows_import_paths else refuse_import_paths()
     try:
         with logging_to_stderr(), followed:

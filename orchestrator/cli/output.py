@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import sys
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,16 +28,10 @@ class TextConsole(Console):
     """A console that shows labels, errors and logs as text, with control characters escaped.
 
     Rich would read ``[...]`` in a label as its markup, and ``:100:`` in a log as an emoji.
-
-    Args:
-        width: in characters; None for that of the terminal.
-        ends_with_reader: whether a reader that is gone, for example ``head``, is a ``BrokenPipeError``. By
-            default the command goes on, without output: it may train, and its exit code counts.
     """
 
-    def __init__(self, *, width: int | None = None, ends_with_reader: bool = False) -> None:
+    def __init__(self, *, width: int | None = None) -> None:
         super().__init__(width=width, markup=False, emoji=False)
-        self._ends_with_reader = ends_with_reader
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         """Render with escaped control characters of texts; colours are Rich's own."""
@@ -44,11 +39,10 @@ class TextConsole(Console):
             yield segment if segment.control else segment._replace(text=printable(segment.text))
 
     def on_broken_pipe(self) -> None:
-        """Go on without output, or pass the error on; Rich would end the process."""
-        if self._ends_with_reader:
-            raise  # noqa: PLE0704  (Rich calls this while it handles the BrokenPipeError)
-        with contextlib.suppress(SystemExit):
+        """Pass the error on to ``main``; Rich would end the process, as if the user's code had."""
+        if threading.current_thread() is not threading.main_thread():
             super().on_broken_pipe()
+        raise  # noqa: PLE0704  (Rich calls this while it handles the BrokenPipeError)
 
 
 @contextmanager

@@ -191,6 +191,7 @@ class LogsRequest(SweepRequest):
     """Print a trial's log."""
 
     example: ClassVar[str] = "recrl-sweep logs demo 3f2a --follow"
+    ends_with_reader: ClassVar[bool] = True
     trial: tuple[str, ...] = by_place(
         nargs="*",
         metavar="TRIAL",

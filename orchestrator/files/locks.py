@@ -1,7 +1,8 @@
 """Lock files, opened without following symbolic links.
 
 Folders of results are shared and copied. If the lock were a symbolic link, truncating the lock would empty
-the file that it points to.
+the file that it points to. A process that a user's code forks inherits open files, and with them their locks.
+So a lock is released explicitly, and a forked process lets go of it.
 """
 
 from __future__ import annotations
@@ -20,13 +21,23 @@ from recrl.orchestrator.errors import StorageError
 FLAGS = os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
 
 
-def open_lock(path: Path) -> IO[str]:
-    """Open a lock for reading and writing, at its end; create it if it is missing.
+_open: set[int] = set()  # descriptors of this process's locks
+
+
+@contextmanager
+def opened_lock(path: Path) -> Iterator[IO[str]]:
+    """Open a lock for reading and writing, at its end; create it if it is missing, and release it at the end.
 
     Raises:
         StorageError: it is a link, a folder or another non-file.
     """
-    return os.fdopen(_opened(path, os.O_RDWR | os.O_CREAT | os.O_APPEND), "a+")
+    with os.fdopen(_opened(path, os.O_RDWR | os.O_CREAT | os.O_APPEND), "a+") as file:
+        _open.add(file.fileno())
+        try:
+            yield file
+        finally:
+            fcntl.flock(file, fcntl.LOCK_UN)
+            _open.discard(file.fileno())
 
 
 @contextmanager
@@ -36,9 +47,21 @@ def locked(path: Path) -> Iterator[None]:
     Raises:
         StorageError: it is a link, a folder or another special file.
     """
-    with open_lock(path) as file:
+    with opened_lock(path) as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
+
+
+def _let_go() -> None:
+    """Let go of the locks of the parent, in a forked process; the descriptors stay open, but for nothing."""
+    null = os.open(os.devnull, os.O_RDWR)
+    for descriptor in _open:
+        os.dup2(null, descriptor, inheritable=False)
+    os.close(null)
+    _open.clear()
+
+
+os.register_at_fork(after_in_child=_let_go)
 
 
 def look_at_lock(path: Path) -> IO[str]:

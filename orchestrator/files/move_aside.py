@@ -20,6 +20,8 @@ def move_aside(path: Path, folder: Path, *, copy: bool = False) -> Path | None:
     place = folder / f"{next_number(folder):03d}-{path.name.lstrip('.')}"
     if copy and path.is_file():
         shutil.copy2(path, place)
+        with place.open("rb") as file:  # a power cut must not take both
+            os.fsync(file.fileno())
     else:
         path.rename(place)
     return place

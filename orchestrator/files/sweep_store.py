@@ -69,7 +69,7 @@ from recrl.orchestrator.files.atomic_files import (
     write_atomically,
     write_sealed,
 )
-from recrl.orchestrator.files.locks import look_at_lock, open_lock
+from recrl.orchestrator.files.locks import look_at_lock, opened_lock
 from recrl.orchestrator.files.move_aside import move_aside
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.trial_files import PathIn
@@ -305,7 +305,7 @@ class SweepStore:
                 move_aside(path, self.aside_folder)
         if self.trials_folder.exists() and not self.trials_folder.is_dir():
             move_aside(self.trials_folder, self.aside_folder)
-        with open_lock(self.lock_path) as file:
+        with opened_lock(self.lock_path) as file:
             if not _try_lock(file):
                 file.seek(0)
                 holder = file.read().strip() or "another process"

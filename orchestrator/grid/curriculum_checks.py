@@ -40,12 +40,13 @@ def unsuitable(trial: TrialSpec, cmdp: CMDPSpec) -> Iterator[tuple[str, str]]:
             f"{method} rewards the policy's entropy, which has no bound with the continuous actions of "
             f"{task}; use another method, or exclude the pair",
         )
-    names_and_limits = zip(cmdp.cost_names, trial.deploy_limits, trial.train_limits, strict=True)
-    never_relaxed = [name for name, deploy, train in names_and_limits if deploy == 0.0 < train]
-    if trial.method.name == "cooling" and never_relaxed:
-        yield (
-            "methods",
-            f"{method} relaxes a limit in proportion to it, so it never relaxes the deploy_limits of 0 of "
-            f"{' and '.join(never_relaxed)} in {task}; use another method, deploy_limits above 0, or "
-            "train_limits of 0",
-        )
+    if trial.method.name == "cooling" and trial.method.options.get("relaxation"):
+        names_and_limits = zip(cmdp.cost_names, trial.deploy_limits, trial.train_limits, strict=True)
+        never_relaxed = [name for name, deploy, train in names_and_limits if deploy == 0.0 < train]
+        if never_relaxed:
+            yield (
+                "methods",
+                f"{method} relaxes a limit in proportion to it, so it never relaxes the deploy_limits of 0 "
+                f"of {' and '.join(never_relaxed)} in {task}; use another method, deploy_limits above 0, or "
+                "train_limits with a 0 there, and .inf for what is to be measured",
+            )

@@ -8,9 +8,10 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from recrl.orchestrator.background_thread import background_thread
@@ -220,9 +221,10 @@ def working_copy(
 
     Raises:
         DamagedError: the store has commits of the trial, and none can be used.
-        StorageError: the store was down for ``RETRY_SECONDS``; its last commit is intact.
+        StorageError: the store was down for ``RETRY_SECONDS``, or this machine's disk is full; the store's
+            last commit is intact.
     """
-    with scratch_folder(tempfile.gettempdir()) as folder:
+    with _scratch(tempfile.gettempdir()) as folder:
         trial = TrialStore(folder / spec.folder_name)
         retry_while_down(lambda: remote.download_for_attempt(trial), should_stop)
         upload = Upload(remote, trial)
@@ -233,6 +235,21 @@ def working_copy(
             _finish(upload, should_stop)
             raise
         _finish(upload, should_stop)
+
+
+@contextmanager
+def _scratch(parent: str) -> Iterator[Path]:
+    """Make a ``scratch_folder``.
+
+    Raises:
+        StorageError: there is no room for one.
+    """
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(scratch_folder(parent))
+        except OSError as error:
+            raise StorageError(f"{parent}: cannot be written ({error.strerror or error})") from error
+        yield folder
 
 
 def _finish(upload: Upload, should_stop: Callable[[], bool]) -> None:

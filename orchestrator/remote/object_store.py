@@ -13,10 +13,12 @@ import copy
 import re
 import secrets
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, Literal
 
 from recrl.orchestrator.errors import RecrlError, StorageError, first_line
+from recrl.orchestrator.files.atomic_files import write_atomically
 
 EXAMPLE = "s3://bucket/folder"
 FOLDERS = ("file", "local")  # schemes where parents must be created before a file; a bucket must not be
@@ -46,6 +48,7 @@ class ObjectStore:
         with self._as_storage_error("cannot be used"):
             self._system, path = fsspec.url_to_fs(self.uri, skip_instance_cache=True, **options)
         self._root = path.rstrip("/")
+        self._is_walked = type(self._system).find is fsspec.AbstractFileSystem.find
 
     def below(self, folder: str) -> ObjectStore:
         """Return the store of a folder below, over the same connections."""
@@ -82,9 +85,8 @@ class ObjectStore:
             if not self._in_folder:
                 self._system.pipe_file(path, data)
                 return
-            beside = f"{path}.{secrets.token_hex(4)}"
-            self._system.pipe_file(beside, data)
-            self._system.mv(beside, path)
+            Path(path).parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(Path(path), data)
 
     def create(self, key: str, data: bytes) -> bool:
         """Create an object unless it exists; return whether it was created.
@@ -116,7 +118,7 @@ class ObjectStore:
         place = self._path(folder).rstrip("/")
         with self._as_storage_error("cannot be listed", unless=FileNotFoundError):
             self._system.invalidate_cache()  # other processes write here, too
-            found = self._system.find(place)
+            found = self._walked(place) if self._is_walked else self._system.find(place)
             return sorted(path[len(place) + 1 :] for path in found if path.startswith(f"{place}/"))
         return []
 
@@ -156,6 +158,22 @@ class ObjectStore:
                 raise StorageError(f"{self.uri}: an object that was written a moment ago is missing")
         finally:
             self.delete([key])
+
+    def _walked(self, folder: str) -> Iterator[str]:
+        """Yield the paths of all objects below a folder.
+
+        fsspec's own walk leaves out folders that cannot be listed. They would seem to be empty.
+
+        Raises:
+            FileNotFoundError: the folder does not exist.
+            OSError: a folder cannot be listed.
+        """
+        for entry in self._system.ls(folder, detail=True):
+            if entry["type"] != "directory":
+                yield entry["name"]
+                continue
+            with suppress(FileNotFoundError):  # deleted meanwhile
+                yield from self._walked(entry["name"])
 
     def _path(self, key: str) -> str:
         return f"{self._root}/{key}"

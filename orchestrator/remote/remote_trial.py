@@ -27,7 +27,8 @@ import logging
 import os
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import PurePosixPath
@@ -77,17 +78,18 @@ class RemoteTrial:
 
         Raises:
             DamagedError: there are commits, and none can be used; the trial must be left alone.
-            StorageError: the store cannot be read.
+            StorageError: the store cannot be read, or the folder cannot be written.
         """
-        keys = self.objects.keys_in()
-        commit = self._pull(trial, keys, checkpoints=True)
-        record = commit.record if commit else TrialRecord()
-        begun = [int(attempt.partition("-")[0]) for attempt in attempts_in(keys)]
-        # the next attempt must be the newest, even if an earlier one made no commit
-        record = replace(record, attempt=max([record.attempt, *begun]))
-        if record.attempt:
-            trial.folder.mkdir(parents=True, exist_ok=True)
-            trial.write_record(record)
+        with _writing(trial):
+            keys = self.objects.keys_in()
+            commit = self._pull(trial, keys, checkpoints=True)
+            record = commit.record if commit else TrialRecord()
+            begun = [int(attempt.partition("-")[0]) for attempt in attempts_in(keys)]
+            # the next attempt must be the newest, even if an earlier one made no commit
+            record = replace(record, attempt=max([record.attempt, *begun]))
+            if record.attempt:
+                trial.folder.mkdir(parents=True, exist_ok=True)
+                trial.write_record(record)
 
     def download(self, trial: TrialStore, keys: Sequence[str] | None = None, *, checkpoints: bool) -> None:
         """Bring a folder up to the newest commit, and to the trial's progress since.
@@ -103,8 +105,12 @@ class RemoteTrial:
 
         Raises:
             DamagedError: there is a link in place of the folder or of its checkpoints.
-            StorageError: the store cannot be read.
+            StorageError: the store cannot be read, or the folder cannot be written.
         """
+        with _writing(trial):
+            self._download(trial, keys, checkpoints=checkpoints)
+
+    def _download(self, trial: TrialStore, keys: Sequence[str] | None, *, checkpoints: bool) -> None:
         _require_no_links(trial)
         keys = self.objects.keys_in() if keys is None else keys
         attempts = attempts_in(keys)
@@ -373,6 +379,19 @@ def _require_no_links(trial: TrialStore) -> None:
     for path in (trial.folder.parent, trial.folder, trial.checkpoints_folder):
         if path.is_symlink():
             raise DamagedError(f"{path}: is a link, it must be a folder; delete it, and it is fetched again")
+
+
+@contextmanager
+def _writing(trial: TrialStore) -> Iterator[None]:
+    """Turn an error of this machine's disk into one that waiting may cure.
+
+    Raises:
+        StorageError: there was one.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"{trial.folder}: cannot be written ({error.strerror or error})") from error
 
 
 def _place(trial: TrialStore, name: str, start: int, data: bytes) -> None:

@@ -58,7 +58,7 @@ def downloaded_export(uri: str, name: str | None) -> Iterator[Download]:
     settings = MLFLOW_SETTINGS | {"MLFLOW_HTTP_REQUEST_TIMEOUT": str(TIMEOUT_SECONDS)}
     with scratch_folder(tempfile.gettempdir()) as folder:
         try:
-            with mlflow_settings(settings):  # a user's own later requests to MLflow have the user's settings
+            with mlflow_settings(settings):  # the user's own requests have other time-outs
                 download = _download(uri, name, folder)
         except RecrlError:
             raise

@@ -99,6 +99,11 @@ class SweepRuns:
         else:
             self.client.set_terminated(run_id, status, end_time=_milliseconds(end))
 
+    def delete_tags(self, run_id: str, names: set[str]) -> None:
+        """Delete those tags of a run that it has; a pass that was interrupted may have deleted them."""
+        for name in names & self.client.get_run(run_id).data.tags.keys():
+            self.client.delete_tag(run_id, name)
+
     def send_files(self, position: Position, paths: Sequence[Path], folder: str | None = None) -> Position:
         """Upload files that exist, are not empty and have changed since their last upload."""
         from mlflow.store.artifact.artifact_repository_registry import (  # noqa: PLC0415

@@ -99,8 +99,7 @@ class TrialSync:
             client, run_id = self._runs.client, position.run_id
             tags = [RunTag(key, value) for key, value in state_tags(record).items()]
             client.log_batch(run_id, tags=tags)
-            for name in {"recrl.verdict", "mlflow.note.content"} & client.get_run(run_id).data.tags.keys():
-                client.delete_tag(run_id, name)
+            self._runs.delete_tags(run_id, {"recrl.verdict", "mlflow.note.content"})
             self._runs.set_status(run_id, "FAILED", record.heartbeat or time.time())
             self._save(trial, replace(position, shown=shown))
         return True
@@ -141,7 +140,7 @@ class TrialSync:
         client.log_batch(run_id, metrics=metrics, params=new_params, tags=tags)
         self._runs.without_params.discard(run_id)
         if position.shown.get("error") and not record.error:
-            client.delete_tag(run_id, "recrl.error")
+            self._runs.delete_tags(run_id, {"recrl.error"})
         return position
 
     def _position(self, trial: TrialStore, record: TrialRecord) -> Position:

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -385,12 +385,13 @@ def test_ctrl_c_stops_cleanly_and_says_how_to_go_on(folder: Path) -> None:
 def test_a_closed_pipe_ends_no_command_and_changes_no_exit_code(folder: Path) -> None:
     """``recrl-sweep launch grid.yaml | head -1``: the reader is gone before anything is written."""
 
-    def without_reader(*arguments: str) -> tuple[int, str]:
+    def without_reader(*arguments: str, closed: Sequence[int] = (1,)) -> tuple[int, str]:
         code = f"""
 import os, sys
 from recrl.orchestrator.cli.main import main
 reader, writer = os.pipe()
-os.dup2(writer, 1)
+for descriptor in {closed}:
+    os.dup2(writer, descriptor)
 os.close(reader)
 sys.exit(main({list(arguments)}))
 """
@@ -398,10 +399,12 @@ sys.exit(main({list(arguments)}))
         return done.returncode, done.stderr
 
     assert without_reader("list", "tasks") == (ExitCode.OK, "")
+    _own_room(folder, "room_printing", "{'cost': print('x' * 1000) or 1.0}", "name: 'room_printing:Room'")
     assert without_reader("launch", "grid.yaml", *INLINE) == (ExitCode.OK, "")
     store = SweepStore(folder / "runs", "small")
     assert all(trial.record().status is TrialStatus.COMPLETE for trial in store.trials())
     assert without_reader("logs", "small", store.trials()[0].trial_id) == (ExitCode.OK, "")
+    assert without_reader("validate", "nothing.yaml", closed=(1, 2)) == (ExitCode.WRONG_INPUT, "")
     store.trials()[0].episodes_path.write_text("cut")
     assert without_reader("check", "small") == (ExitCode.TRIALS_FAILED, "")
 

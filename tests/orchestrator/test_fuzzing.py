@@ -8,8 +8,11 @@ import hashlib
 import json
 import os
 import struct
-from typing import Any
+from collections import OrderedDict
+from enum import IntEnum
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 import yaml
 from hypothesis import HealthCheck, example, given, settings
@@ -121,16 +124,41 @@ def test_any_plain_values_are_read_as_they_were_written(tree: dict[str, Any]) ->
     assert repr(document.value) == repr(tree)  # NaN is not equal to itself
 
 
+class Number(IntEnum):
+    ONE = 1
+
+
+class Fraction(float):
+    pass
+
+
+class Pair(NamedTuple):
+    first: int
+    second: str
+
+
+def test_values_of_derived_types_are_those_of_the_plain_ones() -> None:
+    tree = {"a": Number.ONE, "b": Fraction(0.5), "c": Pair(1, "1"), "d": np.float32(0.5), "e": np.arange(2)}
+    plain = {"a": 1, "b": 0.5, "c": [1, "1"], "d": 0.5, "e": [0, 1]}
+    assert repr(parse(dump(OrderedDict(tree))).value) == repr(plain)
+
+
 @pytest.mark.parametrize("value", [{1}, b"x", object(), print])
 def test_other_values_are_not_written(value: object) -> None:
     with pytest.raises(TypeError, match="cannot represent an object"):
         dump({"a": [value]})
 
 
+@pytest.mark.parametrize("tree", [{"a": 10**5000}, ["abc"], 5])
+def test_a_number_too_long_and_what_is_no_mapping_are_not_written(tree: Any) -> None:
+    with pytest.raises(TypeError):
+        dump(tree)
+
+
 def test_a_value_in_itself_is_not_written() -> None:
     endless: dict[str, Any] = {}
     endless["a"] = endless
-    with pytest.raises(TypeError, match="a value contains itself"):
+    with pytest.raises(TypeError, match="a value contains itself, or is nested too deeply"):
         dump(endless)
 
 

@@ -263,12 +263,14 @@ def test_cooling_cannot_relax_limits_of_0() -> None:
     assert problem == (
         "grid.yaml:4: methods.1: cooling relaxes a limit in proportion to it, so it never relaxes the "
         "deploy_limits of 0 of wear in two-state; use another method, deploy_limits above 0, or "
-        "train_limits of 0"
+        "train_limits with a 0 there, and .inf for what is to be measured"
     )
     two = cooling.replace("two-state, ", "two-state-2, ")
     (problem,) = _problems(two.replace("limits: 2", "limits: [2, 0]"))
     assert "so it never relaxes the deploy_limits of 0 of noise in two-state-2; use" in problem
-    assert len(_grid(two.replace("limits: 2", "limits: [2, 0], train_limits: [4, 0]")).trials()) == 4
+    assert len(_grid(two.replace("limits: 2", "limits: [2, 0], train_limits: [.inf, 0]")).trials()) == 4
+    unrelaxed = SMALL.replace("linear", "{name: cooling, options: {relaxation: 0}}")
+    assert len(_grid(unrelaxed.replace("limits: 2", "limits: 0")).trials()) == 4
 
 
 def test_cooling_needs_discrete_actions() -> None:

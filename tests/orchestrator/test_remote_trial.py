@@ -1,11 +1,13 @@
 """A trial in an object store is there whole or as it was before, whoever writes, fails or comes back."""
 
+import errno
 import hashlib
 import json
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import fsspec
 import numpy as np
@@ -196,6 +198,52 @@ def test_a_local_copy_leaves_checkpoints_of_running_trials_where_they_are(
     machine.upload.finish()
     there = local_copy(bucket, tmp_path / "copy", checkpoints=False)
     assert [path.name for path in there.checkpoints()] == ["checkpoint-00000002.recrl"]
+
+
+def test_a_folder_that_cannot_be_listed_for_once_is_not_taken_for_an_empty_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    remote = RemoteTrial(ObjectStore(f"file://{tmp_path}/bucket"), SPEC.folder_name)
+    machine = Machine(remote, tmp_path / "machine")
+    machine.work(1)
+    machine.upload.push()
+    attempt = next(iter(remote.objects.keys_in())).partition("/")[0]
+
+    def stale(folder: str, **given: Any) -> Any:
+        if folder.endswith(attempt):
+            raise OSError(errno.ESTALE, "Stale file handle")
+        return listed(folder, **given)
+
+    listed = remote.objects._system.ls
+    with monkeypatch.context() as away:
+        away.setattr(remote.objects._system, "ls", stale)
+        with pytest.raises(StorageError, match="cannot be listed"):
+            remote.download_for_attempt(TrialStore(tmp_path / "other" / SPEC.folder_name))
+    assert updates(local_copy(remote, tmp_path / "copy")) == [1]
+
+
+def test_a_full_disk_of_this_machine_is_waited_for(
+    bucket: RemoteTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = Machine(bucket, tmp_path / "machine")
+    machine.work(1)
+    machine.upload.push()
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as away:
+        away.setattr("recrl.orchestrator.remote.remote_trial.write_atomically", full)
+        with pytest.raises(StorageError, match=r"cannot be written \(No space left on device\)"):
+            local_copy(bucket, tmp_path / "copy")
+    with monkeypatch.context() as away:
+        away.setattr("tempfile.mkdtemp", full)
+        with (
+            pytest.raises(StorageError, match=r"cannot be written \(No space left on device\)"),
+            working_copy(bucket, SPEC, lambda: False),
+        ):
+            pass
+    assert updates(local_copy(bucket, tmp_path / "copy")) == [1]
 
 
 def test_many_commits_leave_few_objects(bucket: RemoteTrial, tmp_path: Path) -> None:

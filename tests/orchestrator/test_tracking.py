@@ -687,6 +687,17 @@ def test_rows_that_were_cut_back_are_gone_from_mlflow_too(
     assert points[19][:2] == (20 * 400, 1700009999000)
 
 
+def test_a_tag_that_is_gone_already_keeps_no_run_from_its_state(write: Callable[..., SweepStore]) -> None:
+    store = write(failed=(DYNAMIC,))
+    uri = tracking_uri(store, None)
+    sync(store, uri)
+    connect(store).delete_tag(runs(store)[DYNAMIC].info.run_id, "recrl.error")  # by a pass that was killed
+    trial = trial_titled(store, DYNAMIC)
+    trial.begin(trial.spec)
+    assert sync(store, uri).is_up_to_date
+    assert runs(store)[DYNAMIC].info.status == "RUNNING"
+
+
 def test_a_resumed_trial_runs_again_and_loses_its_error(write: Callable[..., SweepStore]) -> None:
     store = write(failed=(DYNAMIC,))
     uri = tracking_uri(store, None)

@@ -1,9 +1,13 @@
 """Nothing committed is ever lost, nothing is there twice, and one attempt at a time may write."""
 
 import errno
+import fcntl
 import json
 import os
 import re
+import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -15,6 +19,7 @@ import pytest
 
 from recrl.orchestrator.errors import DamagedError, LostLeaseError, StorageError, SweepBusyError
 from recrl.orchestrator.files.atomic_files import write_atomically
+from recrl.orchestrator.files.locks import opened_lock
 from recrl.orchestrator.files.move_aside import move_aside
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
@@ -235,6 +240,40 @@ def test_one_process_at_a_time_runs_a_sweep(tmp_path: Path) -> None:
         pass
     with store.lock():
         pass
+
+
+@pytest.mark.parametrize("ending", ["pass", "os._exit(0)"])
+def test_a_process_that_a_users_code_forked_keeps_no_lock(tmp_path: Path, ending: str) -> None:
+    code = f"""
+import os, sys, time
+from pathlib import Path
+from recrl.orchestrator.files.locks import locked
+from recrl.orchestrator.files.sweep_store import SweepStore
+with SweepStore(Path(sys.argv[1]), "sweep").lock(), locked(Path(sys.argv[1]) / "lock"):
+    child = os.fork()
+    if not child:
+        os.close(1)
+        time.sleep(60)
+        os._exit(0)
+    print(child, flush=True)
+    {ending}
+"""
+    done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True)
+    try:
+        assert not SweepStore(tmp_path, "sweep").is_locked()
+        with opened_lock(tmp_path / "lock") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    finally:
+        os.kill(int(done.stdout), signal.SIGKILL)
+
+
+def test_a_lock_ends_with_its_block_although_another_descriptor_shares_it(tmp_path: Path) -> None:
+    with opened_lock(tmp_path / "lock") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        shared = os.dup(file.fileno())
+    with opened_lock(tmp_path / "lock") as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    os.close(shared)
 
 
 def test_who_only_looks_whether_a_sweep_runs_keeps_nobody_from_running_it(tmp_path: Path) -> None:
