@@ -383,7 +383,7 @@ def _require_no_links(trial: TrialStore) -> None:
 
 @contextmanager
 def _writing(trial: TrialStore) -> Iterator[None]:
-    """Turn an error of this machine's disk into one that waiting may cure.
+    """Turn an error of this machine's disk into a StorageError, which is waited for.
 
     Raises:
         StorageError: there was one.
