@@ -25,15 +25,17 @@ class _LastingFile(io.FileIO):
 def let_streams_last(*, output: bool) -> None:
     """Replace the standard error of this process, and its standard output, unless they were replaced before.
 
-    Also what a user's code prints goes nowhere then, instead of failing.
+    Also what a user's code prints goes nowhere then, instead of failing. So does output to closed streams.
 
     Args:
-        output: whether to replace the output, too.
+        output: whether the output is to last, too.
     """
-    if output and sys.stdout is sys.__stdout__:
-        sys.stdout = _lasting(sys.stdout)
-    if sys.stderr is sys.__stderr__:
-        sys.stderr = _lasting(sys.stderr)
+    for name, lasts in (("stdout", output), ("stderr", True)):
+        stream = getattr(sys, name)
+        if stream is None:  # closed, as by >&-
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115  (until the end)
+        elif lasts and stream is getattr(sys, f"__{name}__"):
+            setattr(sys, name, _lasting(stream))
 
 
 def _lasting(stream: Any) -> TextIO:

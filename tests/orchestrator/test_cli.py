@@ -409,6 +409,15 @@ sys.exit(main({list(arguments)}))
     assert without_reader("check", "small") == (ExitCode.TRIALS_FAILED, "")
 
 
+@pytest.mark.parametrize("arguments", ["list tasks", "status nothing", "logs nothing a"])
+def test_closed_streams_are_no_traceback(folder: Path, arguments: str) -> None:
+    for closed in (">&-", "2>&-"):
+        command = f"{shlex.quote(sys.executable)} -m recrl {arguments} {closed}"
+        done = subprocess.run(command, shell=True, cwd=folder, capture_output=True, text=True, check=False)
+        assert done.returncode == (ExitCode.OK if arguments == "list tasks" else ExitCode.WRONG_INPUT)
+        assert "Traceback" not in done.stderr
+
+
 def test_a_terminal_without_a_sign_shows_another(folder: Path) -> None:
     assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
     done = subprocess.run(
