@@ -209,7 +209,8 @@ class ProximityObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
         scales: length scales in metres.
 
     Raises:
-        ValueError: no lidar is declared.
+        ValueError: no lidar is declared, the components are not those of an observation, or a scale is not
+            above 0.
     """
 
     def __init__(
@@ -227,6 +228,12 @@ class ProximityObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
                 f"proximity features need observations that are vectors with a declared lidar, got {space}; "
                 "give components"
             )
+        if (declared := sum(part.size for part in components or ())) != space.shape[0]:
+            raise ValueError(
+                f"components: must have the {space.shape[0]} numbers of an observation, got {declared}"
+            )
+        if not all(0.0 < scale < np.inf for scale in scales):
+            raise ValueError(f"scales: must be finite and above 0, got {list(scales)}")
         self._encoder = Encoder(
             space.shape[0], components or (), scales=scales, normalise=np.zeros(space.shape[0], np.bool_)
         )

@@ -45,3 +45,19 @@ def with_error(mean: float, error: float, *, digits: int = 2) -> str:
     shown = 1 if abs(mean) >= 100.0 else digits
     text = f"{mean:z.{shown}f}"  # z: no -0.00
     return text if math.isnan(error) else f"{text} ± {error:.{shown}f}"
+
+
+def cost_with_error(mean: float, error: float, *, exact: bool) -> str:
+    """Format the mean cost of policies as ``with_error`` does.
+
+    An exact cost has three digits, because it is compared with a limit to within 1%.
+
+    Args:
+        mean: NaN becomes a dash.
+        error: of the mean, or NaN.
+        exact: whether the cost was computed, not sampled.
+
+    >>> cost_with_error(5.002, 0.001, exact=True), cost_with_error(33.477, 7.471, exact=False)
+    ('5.002 ± 0.001', '33.48 ± 7.47')
+    """
+    return with_error(mean, error, digits=3 if exact else 2)

@@ -68,14 +68,23 @@ class StochasticPolicy(ABC):
         )
         self._num_layers = len(self.parameters.tensors) - (num_spreads > 0)
         self._acting = self.parameters.values.cpu()  # on a CPU the parameters themselves
+        self._share_for_acting()
+        self._scratch: list[Scratch] = []
+        self._latest: _Latest | None = None
+
+    def _share_for_acting(self) -> None:
+        """Make the NumPy arrays that share memory with the tensors for acting."""
         self._acting_pieces = [piece.numpy() for piece in self.parameters.pieces(self._acting)]
         self._layers = (
             [layer[0] for layer in self._acting_pieces[: self._num_layers]]
             if isinstance(self.stack, TanhStack)
             else None
         )
-        self._scratch: list[Scratch] = []
-        self._latest: _Latest | None = None
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the attributes of ``copy.deepcopy``, which separates NumPy arrays from their tensors."""
+        self.__dict__.update(state)
+        self._share_for_acting()
 
     @abstractmethod
     def sample(

@@ -155,12 +155,15 @@ class GaussianPolicy(StochasticPolicy):
         self._least_log_std = math.log(least) if least else -math.inf
         self.bound_std()
         self.publish()
-        self._acting_log_std = self._acting_pieces[-1]
 
     @property
     def log_std(self) -> Tensor:
         """The log standard deviations, [m]."""
         return self.parameters.tensors[-1]
+
+    @property
+    def _acting_log_std(self) -> npt.NDArray[np.float32]:
+        return self._acting_pieces[-1]
 
     def sample(
         self, observations: npt.NDArray[np.float32], generator: np.random.Generator

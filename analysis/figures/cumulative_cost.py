@@ -112,5 +112,5 @@ def _legend(figure: Figure, agent: str, drawn: set[str]) -> None:
         for colour, dashes, name in REFERENCES.values()
         if name in drawn
     ]
-    title = f"{agent}: cost of training, summed over its policies\nevery run thin, the mean thick"
+    title = f"{agent}: cost of training, one episode of each policy, summed\nevery run thin, the mean thick"
     panels.legend_above(figure, handles, most=panels.REFERENCES_A_LINE, title=title)

@@ -170,7 +170,7 @@ def _points(axes: Axes, rows: pd.DataFrame, look: dict[str, MethodStyle], *, far
         axes.scatter(
             np.minimum(chosen[COST].to_numpy(np.float64), far),
             chosen["episode_return"].to_numpy(np.float64),
-            s=(9.0 - 1.3 * min(position, 5)) ** 2,
+            s=_mark_size(position) ** 2,
             marker=style.marker,
             facecolors=[(style.colour, FILL) if feasible else "white" for feasible in chosen["feasible"]],
             edgecolors=style.colour,
@@ -179,6 +179,11 @@ def _points(axes: Axes, rows: pd.DataFrame, look: dict[str, MethodStyle], *, far
             zorder=3.0,
         )
     axes.set_xlim(-0.05 * far, far)
+
+
+def _mark_size(position: int) -> float:
+    """Return the diameter of a method's marks, in points."""
+    return 9.0 - 1.3 * min(position, 5)
 
 
 def _legend(
@@ -200,7 +205,7 @@ def _legend(
             color=look[method].colour,
             marker=look[method].marker,
             markerfacecolor="none",
-            markersize=5.0,
+            markersize=_mark_size(list(look).index(method)),
             linestyle="none",
             label=method,
         )
@@ -215,6 +220,8 @@ def _legend(
         references.append(best)
     panels.legend_below(figure, references)
     title = "final policies, one mark per run: filled if feasible, hollow if not"
+    if len(methods) > 1:
+        title += "\nsmaller marks only show runs that are equal"
     if clipped:
         title += "\nmarks on the right edge: the cost is beyond the axis"
     panels.legend_above(

@@ -26,8 +26,8 @@ from recrl.analysis.statistics.verdicts import SOLVED_GAP
 from recrl.orchestrator.files.outcomes_file import OUTCOMES_FILE
 from recrl.orchestrator.number_texts import DASH
 
-COST_AND_BOUNDS = "Cumulative cost of training against its bounds"
-COST_AND_LIMITS = "Cumulative cost of training against the limits in force"
+COST_AND_BOUNDS = "Cost of training, one episode of each policy, against its bounds"
+COST_AND_LIMITS = "Cost of training, one episode of each policy, against the limits in force"
 BOOTSTRAP_SEED = 0
 SHOWN_MEASURES = (Measure.STOCHASTIC, Measure.DETERMINISTIC, Measure.DEPLOYMENT)
 

@@ -17,7 +17,7 @@ from recrl.analysis.data.labels import GROUP
 from recrl.analysis.statistics.intervals import share_text
 from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.files.atomic_files import write_atomically
-from recrl.orchestrator.number_texts import DASH, number, with_error
+from recrl.orchestrator.number_texts import DASH, cost_with_error, number, with_error
 from recrl.orchestrator.redaction import printable
 
 TOO_FEW = "†"
@@ -66,7 +66,7 @@ def outcome_table(summary: pd.DataFrame, measure: Measure, suffixes: Sequence[st
             line["failed"] = str(row["failed"])
         for name in costs:
             which = _cost_suffix(suffixes, name, len(costs))
-            line[f"cost{which}"] = with_error(row[name], row[f"{name}_se"], digits=3)  # 5.002 is above 5
+            line[f"cost{which}"] = cost_with_error(row[name], row[f"{name}_se"], exact=row["exact"])
             line[f"limit{which}"] = number(row[f"deploy_limit_{name[5:]}"])
         line["return"] = with_error(row["episode_return"], row["episode_return_se"])
         seeds, feasible = int(row["seeds"]), int(row["feasible_seeds"])

@@ -7,7 +7,7 @@ import pandas as pd
 from recrl.analysis.report.table_formats import names_of, with_interval
 from recrl.analysis.statistics.verdicts import costs_of, is_cost
 from recrl.orchestrator.files.outcomes_file import FEASIBLE, INFEASIBLE, SOLVED
-from recrl.orchestrator.number_texts import DASH, number, with_error
+from recrl.orchestrator.number_texts import DASH, cost_with_error, number, with_error
 
 DEPLOYMENT = "deployment phase (learning goes on)"
 DIFFERENCE = "difference to none"
@@ -25,13 +25,14 @@ WARNINGS = {
 
 
 def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per task, agent and curriculum, as text.
+    """Return one row per task, agent and curriculum, as text; without a known optimum it has no such column.
 
     Args:
         verdicts: of ``verdict_counts.count_verdicts``.
     """
     costs = [str(name) for name in verdicts if is_cost(str(name))]
     warned = bool(verdicts[list(WARNINGS)].to_numpy().any())
+    any_known = bool(verdicts["optimal_return"].notna().any())
     lines = []
     for _, row in verdicts.iterrows():
         line = names_of(row) | {"verdict": verdict_text(row)}
@@ -39,14 +40,15 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
             line["warning"] = warning_text(row)
         for name in costs:
             which = "" if len(costs) == 1 else f" {_label(verdicts, name[5:])}"
-            line[f"cost{which}"] = with_error(row[name], row[f"{name}_se"], digits=3)
+            line[f"cost{which}"] = cost_with_error(row[name], row[f"{name}_se"], exact=row["exact"])
             line[f"limit{which}"] = number(row[f"deploy_limit_{name[5:]}"])
         line["return"] = with_error(row["episode_return"], row["episode_return_se"])
-        line["optimum"] = number(row["optimal_return"])
+        if any_known:
+            line["optimum"] = number(row["optimal_return"])
         line[DIFFERENCE] = _gain_text(row)
         line["n"] = str(row["seeds"])
         earned = with_error(row["deployment_return"], row["deployment_return_se"])
-        paid = [with_error(row[f"deployment_{it}"], row[f"deployment_{it}_se"], digits=3) for it in costs]
+        paid = [with_error(row[f"deployment_{it}"], row[f"deployment_{it}_se"]) for it in costs]
         line[DEPLOYMENT] = f"return {earned}, cost {', '.join(paid)}"
         lines.append(line)
     return pd.DataFrame(lines)

@@ -43,13 +43,16 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
     )
     errors = ["A return or cost is a mean over seeds ± its standard error."] if several else []
     intervals = not_corrected(verdict_table(verdicts)[[DIFFERENCE]])
+    any_known = bool(verdicts["optimal_return"].notna().any())
+    solved = f"Solved: feasible, and within {SOLVED_GAP} of the constrained optimum, where that is known."
+    above = "The return of an infeasible policy may be above the optimum: it is no success."
     return [
         f"The verdict, the return and the cost are those of the final policy, without learning: "
         f"{measured_how(verdicts)}.",
         *errors,
-        f"Solved: feasible, and within {SOLVED_GAP} of the constrained optimum, where that is known.",
+        *([solved] if any_known else []),
         tolerance_sentence(verdicts, exact=all_exact(verdicts)),
-        "The return of an infeasible policy may be above the optimum: it is no success.",
+        *([above] if any_known else []),
         *([failed] if verdicts["failed"].any() else []),
         *([pending] if verdicts["pending"].any() else []),
         f"The difference to 'none' is a mean over the seeds that both have{interval}. It is left out where "

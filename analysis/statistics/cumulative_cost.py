@@ -1,7 +1,7 @@
 """Cumulative cost of a training phase against its theoretical bounds: Proposition 1 on a sweep's trials.
 
 Everything is summed over the n policies of the training phase, one expected episode each, as in
-``recrl.teachers.bounds``; a trial that collects E episodes with each policy costs E times as much.
+``recrl.teachers.bounds``; only ``measured_over_deploy`` is summed over all recorded episodes.
 
 Undiscounted (the unit of all limits here), one row per trial:
 
@@ -18,6 +18,9 @@ Undiscounted (the unit of all limits here), one row per trial:
 In the two net costs, policies below a limit count against policies above it, so they may be negative. In
 ``overshoot_sum`` they do not, but it is biased upwards. C_b is a mean of few episodes, so the sum is far
 above 0 even if the expected cost of every policy is that of its limit.
+
+    measured_over_deploy    sum_b E_b (C_b - d_d), the net cost of all E_b recorded episodes of each policy
+                            above the deployment limit
 
 If no episode ends while a policy is in use, its C_b is that of the policy before. At the beginning of
 training it is that of the first policy with an episode. ``metrics.training_totals`` counts the others.
@@ -163,6 +166,7 @@ def cumulative_costs(sweep: Sweep, *, cost: int | Mapping[str, int] = 0) -> pd.D
             dict(zip(KEY, key, strict=True))
             | {"train_limit": float(given), "deploy_limit": deploy}
             | {"episodes_per_policy": float(runs[key]["episodes"].mean())}
+            | {"measured_over_deploy": _net_cost(runs[key], i, deploy)}
             | _sums(policies_of(sweep, trial, runs[key], cost=i), deploy)
         )
     rows = pd.DataFrame(lines)
@@ -185,7 +189,7 @@ def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.
 
     Returns:
         GROUP, policies, episodes_per_policy, overshoot (assumed, per policy); used_train_limit (the largest
-        of the runs); measured_over_deploy (of the worst run, over all episodes); largest_train_limit (NaN if
+        of the runs); measured_over_deploy (the largest of the runs); largest_train_limit (NaN if
         d_t = d_d exceeds the budget, infinite if d_t does not matter).
 
     Raises:
@@ -212,7 +216,7 @@ def admissible_limits(rows: pd.DataFrame, sweep: Sweep, *, budget: float) -> pd.
             dict(zip(GROUP, group, strict=True))
             | {"policies": policies, "episodes_per_policy": episodes, "overshoot": overshoot}
             | {"used_train_limit": float(runs["train_limit"].max())}
-            | {"measured_over_deploy": float((runs["over_deploy_sum"] * runs["episodes_per_policy"]).max())}
+            | {"measured_over_deploy": float(runs["measured_over_deploy"].max())}
             | {"largest_train_limit": limit}
         )
     return pd.DataFrame(lines)
@@ -265,6 +269,11 @@ def _discount(sweep: Sweep, trial: pd.Series) -> float | None:
     if trial["agent_name"] != "cpo":
         return None
     return float(discount) if isinstance(discount, int | float) else math.nan
+
+
+def _net_cost(updates: pd.DataFrame, cost: int, deploy: float) -> float:
+    """Return ``measured_over_deploy`` of a trial; updates without an episode have no cost and add none."""
+    return float((updates["episodes"] * (updates[f"cost_{cost}"] - deploy)).sum())
 
 
 def _sums(policies: pd.DataFrame, deploy: float) -> dict[str, float]:

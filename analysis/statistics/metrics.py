@@ -121,8 +121,8 @@ def summary(rows: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         GROUP, measure, seeds (complete trials), failed (failed trials), then mean and standard error
-        (``_se``) of episode_return, cost_i and gap, deploy_limit_i, optimal_return; feasible_seeds and their
-        share of the complete and failed trials, feasible_share, with Wilson's 95% interval (feasible_low,
+        (``_se``) of episode_return, cost_i and gap, deploy_limit_i, optimal_return, exact (whether every seed
+        is; false without one); feasible_seeds and their share of the complete and failed trials, feasible_share, with Wilson's 95% interval (feasible_low,
         feasible_high); optimal_seeds with Wilson's interval of their share (optimal_low, optimal_high).
         Groups without a complete or failed trial are left out.
     """
@@ -144,6 +144,7 @@ def summary(rows: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
             for name in averaged:
                 line[name], line[f"{name}_se"] = mean_and_standard_error(chosen[name].to_numpy(np.float64))
             line |= {name: planned[name].iloc[0] for name in constant}
+            line["exact"] = bool(len(chosen) and chosen["exact"].all())
             lines.append(line | _shares(chosen, len(chosen) + failed))
     return pd.DataFrame(lines)
 

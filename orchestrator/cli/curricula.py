@@ -74,7 +74,8 @@ def run_bound(request: BoundRequest, console: Console) -> ExitCode:
             console,
             "An estimate, not a bound: each policy is taken to exceed its limit as in the worst run. That "
             "overshoot is the positive part of each update's sampled mean. With few episodes per policy it "
-            "is too large, and d_t too small. For dynamic, d_t is taken to be in force throughout. "
+            "is too large, and d_t too small. Each policy is taken to collect equally many episodes. For "
+            "dynamic, d_t is taken to be in force throughout. "
             "unconstrained, cooling and curricula of your own are left out.",
         )
     return ExitCode.OK

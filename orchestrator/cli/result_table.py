@@ -15,7 +15,7 @@ from recrl.analysis.report.verdict_terms import all_exact, measured_how, toleran
 from recrl.analysis.statistics.metrics import outcomes
 from recrl.analysis.statistics.verdict_counts import count_verdicts
 from recrl.analysis.statistics.verdicts import SOLVED_GAP
-from recrl.orchestrator.number_texts import number, with_error
+from recrl.orchestrator.number_texts import cost_with_error, number, with_error
 
 
 def result_table(sweep: Sweep) -> tuple[pd.DataFrame, str]:
@@ -57,6 +57,6 @@ def _line(row: pd.Series, suffixes: Sequence[str]) -> dict[str, str]:
     line = names_of(row) | {"n": str(row["seeds"])}
     line["return"] = with_error(row["episode_return"], row["episode_return_se"])
     for i, which in enumerate(suffixes):
-        line[f"cost{which}"] = with_error(row[f"cost_{i}"], row[f"cost_{i}_se"], digits=3)
+        line[f"cost{which}"] = cost_with_error(row[f"cost_{i}"], row[f"cost_{i}_se"], exact=row["exact"])
         line[f"limit{which}"] = number(row[f"deploy_limit_{i}"])
     return line | {"verdict": verdict_text(row)}

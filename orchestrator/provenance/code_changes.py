@@ -36,7 +36,7 @@ MODULES = (  # of the orchestrator
     "trial/trial.py",
     "trial/attempt.py",
     "trial/device.py",
-    "trial/one_thread.py",
+    "trial/torch_settings.py",
     "spec.py",
 )
 SUFFIXES = (".py", ".xml", ".txt")

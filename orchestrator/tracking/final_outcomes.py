@@ -23,7 +23,7 @@ from recrl.orchestrator.files.outcomes_file import (
 )
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
-from recrl.orchestrator.number_texts import number, with_error
+from recrl.orchestrator.number_texts import cost_with_error, number
 from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.tracking.positions import file_mark
 
@@ -134,7 +134,7 @@ def trial_note(outcome: FinalOutcome, start_limits: Sequence[float]) -> str:
     """
     how = "computed exactly" if outcome.exact else "means over sampled episodes"
     verdict = f"{outcome.verdict}{_by(outcome.excesses)}"
-    costs = ", ".join(with_error(cost, math.nan, digits=3) for cost in outcome.costs)
+    costs = ", ".join(cost_with_error(cost, math.nan, exact=outcome.exact) for cost in outcome.costs)
     return (
         f"**{verdict}**: return {number(outcome.episode_return)}, cost {costs}, "
         f"limit d_d {_listed(outcome.limits)}, training limit d_t {_listed(start_limits)}.\n\n"

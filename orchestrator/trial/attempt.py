@@ -27,7 +27,7 @@ from recrl.orchestrator.redaction import shown
 from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.trial.device import device_name, learning_on
 from recrl.orchestrator.trial.heartbeat import Heartbeat
-from recrl.orchestrator.trial.one_thread import one_thread
+from recrl.orchestrator.trial.torch_settings import torch_settings
 from recrl.orchestrator.trial.trial import Trial, open_environments
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import Teacher
@@ -135,7 +135,7 @@ def _located(where: str, writer: TrialWriter) -> Iterator[None]:
         raise
 
 
-@one_thread()  # equal bytes on all machines, and no load on other trials' cores
+@torch_settings()  # equal bytes on all machines, and no load on other trials' cores
 def run_recorded(
     spec: TrialSpec,
     store: TrialStore,

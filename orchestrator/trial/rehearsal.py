@@ -19,7 +19,7 @@ from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.agent_answers import checked_noise
-from recrl.orchestrator.trial.one_thread import one_thread
+from recrl.orchestrator.trial.torch_settings import torch_settings
 from recrl.orchestrator.trial.trial import Trial, TrialSeeds, open_environments
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import TeacherSpec
@@ -60,7 +60,7 @@ def rehearse(spec: TrialSpec) -> None:
         deploy_steps=num_envs * steps,
         evaluation_episodes=0,
     )
-    with one_thread(), scratch_folder(tempfile.gettempdir()) as scratch:
+    with torch_settings(), scratch_folder(tempfile.gettempdir()) as scratch:
         whole = _run(small, spec.teacher, scratch / "whole", restart=False)
         try:
             resumed = _run(small, spec.teacher, scratch / "resumed", restart=True)

@@ -10,7 +10,7 @@ from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import TrialSpec
-from recrl.orchestrator.trial.one_thread import one_thread
+from recrl.orchestrator.trial.torch_settings import torch_settings
 from recrl.orchestrator.trial.trial import Trial
 from recrl.teachers.registry import make_teacher
 
@@ -31,7 +31,7 @@ def measured_speed(spec: TrialSpec, *, seconds: float = MEASURED_SECONDS) -> flo
         RecrlError: the task or the agent raised an error.
     """
     try:
-        with one_thread(), scratch_folder(tempfile.gettempdir()) as scratch:
+        with torch_settings(), scratch_folder(tempfile.gettempdir()) as scratch:
             store = TrialStore(scratch / spec.folder_name)
             with closing(Trial(spec, store.begin(spec), make_teacher(spec.teacher))) as trial:
                 return _speed(trial, seconds)

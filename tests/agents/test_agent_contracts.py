@@ -1,5 +1,6 @@
 """What every agent promises, whatever its algorithm (``recrl.agents.agent.Agent``)."""
 
+import copy
 import gc
 import math
 from dataclasses import replace
@@ -51,6 +52,16 @@ class Lessons:
         rollout, episodes = self.collect()
         costs = episode_costs(episodes, self.num_costs)
         return self.agent.update(rollout, costs, self.step(limit, entropy_coefficient))
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+def test_a_deep_copy_goes_on_as_the_original_would(agent: str) -> None:
+    lessons = Lessons(agent, "two-state")
+    lessons.update()
+    copied = copy.deepcopy(lessons)
+    expected, found = ([it.update(), it.update()] for it in (lessons, copied))
+    np.testing.assert_equal(found, expected)
+    assert flattened(lessons.agent.state_dict()) == flattened(copied.agent.state_dict())
 
 
 def without_an_end(rollout: Rollout) -> Rollout:

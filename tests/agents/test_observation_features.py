@@ -111,6 +111,14 @@ def test_the_wrapper_refuses_observations_in_which_nothing_is_a_lidar() -> None:
         ProximityObservation(gymnasium.make("CartPole-v1"))
 
 
+def test_the_wrapper_refuses_other_components_and_scales_of_0() -> None:
+    plain = gymnasium.make("recrl.environments.registration:recrl/CarGoal2-v0")
+    with pytest.raises(ValueError, match=r"^components: must have the 72 numbers of an observation, got 3$"):
+        ProximityObservation(plain, (SPEED, WALLS))
+    with pytest.raises(ValueError, match=r"^scales: must be finite and above 0, got \[0\.15, 0\.0\]$"):
+        ProximityObservation(plain, scales=(0.15, 0.0))
+
+
 @pytest.mark.parametrize(
     ("task", "option", "expected"),
     [

@@ -1,5 +1,7 @@
 """Policies: their distributions, sampling, noise, and the trust region's metric."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -22,6 +24,22 @@ SPACES = [THREE_ACTIONS, TWO_COMPONENTS]
 
 def policy_for(space: Space[object], last_scale: float = 1.0) -> StochasticPolicy:
     return make_policy(3, space, FORM, last_scale, torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_a_copy_acts_with_its_own_parameters(space: Space[object]) -> None:
+    policy = policy_for(space)
+    copied = copy.deepcopy(policy)
+    rows = random_rows().numpy()
+    before = policy.sample(rows, np.random.default_rng(0)).tolist()
+    copied.parameters.values.mul_(-2.0)
+    copied.publish()
+    expected = policy_for(space)
+    expected.parameters.values.mul_(-2.0)
+    expected.publish()
+    own = [it.sample(rows, np.random.default_rng(0)).tolist() for it in (policy, copied, expected)]
+    assert own == [before, own[2], own[2]]
+    assert copied.mode(rows).tolist() == expected.mode(rows).tolist() != policy.mode(rows).tolist()
 
 
 def random_rows(count: int = 6) -> Tensor:

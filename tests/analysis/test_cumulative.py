@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from recrl.analysis.data import sweep_data
+from recrl.analysis.data.labels import KEY
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.figures.cumulative_cost import cumulative_bounds
 from recrl.analysis.report.figure_list import drawings
@@ -122,6 +123,25 @@ def test_a_budget_is_spent_by_the_limit_it_allows(finished: Sweep) -> None:
     assert table["largest d_t"].tolist() == ["none"]
 
 
+def test_the_measured_cost_is_that_of_all_episodes_also_if_policies_have_unequal_numbers(
+    finished: Sweep,
+) -> None:
+    sweep = three_policies(finished)
+    updates = sweep.updates.assign(cost_0=[30.0, 6.0, math.nan], episodes=[1, 9, 0])
+    rows = cumulative_cost.cumulative_costs(dataclasses.replace(sweep, updates=updates))
+    assert rows["measured_over_deploy"].tolist() == [1 * 25.0 + 9 * 1.0]
+    assert rows["over_deploy_sum"].tolist() == [25.0 + 1.0 + 1.0]
+
+
+def test_the_measured_cost_is_that_of_the_recorded_episodes(finished: Sweep) -> None:
+    rows = cumulative_cost.cumulative_costs(finished)
+    totals = rows.merge(training_totals(finished), on=list(KEY))
+    assert len(totals) == len(rows) > 0
+    expected = totals["cost_0_total"] - totals["episodes"] * totals["deploy_limit"]
+    # mean costs of updates have six digits
+    assert totals["measured_over_deploy"].to_numpy() == pytest.approx(expected.to_numpy(), rel=1e-4, abs=0.1)
+
+
 def test_a_label_may_be_another_curriculum_on_another_task(finished: Sweep) -> None:
     """As in merged files; ``unconstrained`` has no bound, and is left out."""
     sweep = three_policies(finished)
@@ -138,7 +158,7 @@ def test_a_label_may_be_another_curriculum_on_another_task(finished: Sweep) -> N
 def test_a_budget_takes_the_worst_of_several_runs(finished: Sweep) -> None:
     sweep = three_policies(finished)
     row = cumulative_cost.cumulative_costs(sweep)
-    rows = pd.concat([row, row.assign(overshoot_sum=6.0, over_deploy_sum=-9.0)], ignore_index=True)
+    rows = pd.concat([row, row.assign(overshoot_sum=6.0, measured_over_deploy=-9.0)], ignore_index=True)
     for order in (rows, rows.iloc[::-1]):
         (found,) = cumulative_cost.admissible_limits(order, sweep, budget=80.0).to_dict("records")
         assert found["overshoot"] == pytest.approx(10.0 / 3.0)
@@ -266,12 +286,12 @@ def test_every_line_of_the_figure_is_the_sum_that_its_label_names(river_grid: Sw
 
 def test_without_a_bound_none_is_announced(finished: Sweep, monkeypatch: pytest.MonkeyPatch) -> None:
     assert {text for text in captions(finished, "bounds")} == {
-        "ppo-lag: Cumulative cost of training against its bounds",
-        "cpo: Cumulative cost of training against its bounds",
+        "ppo-lag: Cost of training, one episode of each policy, against its bounds",
+        "cpo: Cost of training, one episode of each policy, against its bounds",
     }
     monkeypatch.setattr(cumulative_cost, "finite_model", lambda name, options: None)
     assert captions(finished, "bounds")[0] == (
-        "ppo-lag: Cumulative cost of training against the limits in force"
+        "ppo-lag: Cost of training, one episode of each policy, against the limits in force"
     )
     rows = cumulative_cost.cumulative_costs(finished)
     table = bound_table(rows[rows["agent"] == "ppo-lag"])

@@ -26,7 +26,7 @@ def test_a_row_a_group_with_absolute_numbers(finished: Sweep) -> None:
         "agent": "ppo-lag",
         "curriculum": "none",
         "n": "3",
-        "cost": "1.933 ± 1.433",
+        "cost": "1.93 ± 1.43",
         "limit": "5.00",
         "return": "-7.33 ± 7.67",
         "optimum": "14.00",
@@ -147,12 +147,15 @@ def test_tables_with_several_intervals_say_that_they_are_not_corrected(
 def test_a_table_of_costs_without_a_bound_does_not_announce_one(finished: Sweep) -> None:
     costs = cumulative_costs(finished)
     bounded = table_files._bounds(costs, "")
-    assert bounded.heading == "Cumulative cost of training against its bounds"
+    assert bounded.heading == "Cost of training, one episode of each policy, against its bounds"
     assert "and of the measured cost where the limit was infinite" in bounded.note
     assert "Trivial bound: " in bounded.note and "trivial bound" in bounded.table
     unknown = costs.assign(bound=math.nan, discounted_bound=math.nan, ceiling_sum=math.nan)
     shown = table_files._bounds(unknown, " fuel")
-    assert shown.heading == "Cumulative cost of training against the limits in force (cost fuel)"
+    assert (
+        shown.heading
+        == "Cost of training, one episode of each policy, against the limits in force (cost fuel)"
+    )
     assert "ound" not in shown.note and not any("bound" in str(name) for name in shown.table)
 
 

@@ -178,7 +178,7 @@ def test_the_table_says_the_verdict_in_words() -> None:
     ]
     assert verdict_kinds(judged(ROWS)) == ["feasible", "infeasible", "solved"]
     assert table["n"].tolist() == ["2", "2", "2"]
-    assert table[DEPLOYMENT].iloc[0] == "return 2.00 ± 1.00, cost 50.000 ± 0.000"
+    assert table[DEPLOYMENT].iloc[0] == "return 2.00 ± 1.00, cost 50.00 ± 0.00"
     assert table["cost"].tolist() == ["2.500 ± 2.500", "6.500 ± 0.500", "5.000 ± 0.000"]
 
 
@@ -197,7 +197,7 @@ def test_one_seed_has_no_interval() -> None:
     assert table["return"].tolist() == ["-20.00"]
     assert table["cost"].tolist() == ["0.000"]
     deployed = verdict_table(judged([ROWS[0], ROWS[6]]))[DEPLOYMENT]
-    assert deployed.tolist() == ["return 1.00, cost 50.000"]
+    assert deployed.tolist() == ["return 1.00, cost 50.00"]
     assert table["verdict"].tolist() == ["feasible"]
 
 

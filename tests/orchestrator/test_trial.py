@@ -187,23 +187,26 @@ def test_killed_and_resumed_equals_undisturbed(undisturbed: TrialStore, tmp_path
     np.testing.assert_equal(final_tree(store), final_tree(undisturbed))
 
 
-def test_a_trial_uses_one_thread_and_leaves_pytorch_those_it_had(
+def test_a_trial_sets_pytorch_and_leaves_it_the_settings_it_had(
     tmp_path: Path, undisturbed: TrialStore
 ) -> None:
     store, seen = SweepStore(tmp_path, "sweep").trial(SPEC), set()
 
     def look() -> bool:
-        seen.add(torch.get_num_threads())
+        seen.add((torch.get_num_threads(), torch.get_default_dtype()))
         return False
 
     before = torch.get_num_threads()
     torch.set_num_threads(3)
+    torch.set_default_dtype(torch.float64)
     try:
-        assert run_recorded(SPEC, store, should_stop=look) is TrialStatus.COMPLETE
-        assert torch.get_num_threads() == 3
+        with torch.inference_mode():
+            assert run_recorded(SPEC, store, should_stop=look) is TrialStatus.COMPLETE
+        assert (torch.get_num_threads(), torch.get_default_dtype()) == (3, torch.float64)
     finally:
         torch.set_num_threads(before)
-    assert seen == {1}
+        torch.set_default_dtype(torch.float32)
+    assert seen == {(1, torch.float32)}
     assert store.episodes_path.read_bytes() == undisturbed.episodes_path.read_bytes()
 
 

@@ -50,7 +50,7 @@ API_OF_CLI = {
 ADAPTERS = {
     "PIL": r"orchestrator\.trial\.videos",
     "av": r"orchestrator\.trial\.videos",
-    "torch": r"agents\..*|orchestrator\.trial\.(one_thread|device)",
+    "torch": r"agents\..*|orchestrator\.trial\.(torch_settings|device)",
     "gymnasium": r"environments\..*|agents\..*",
     "minigrid": r"environments\.rivergrid\..*",
     "mujoco": r"environments\.(simulation|safety_gym|velocity)\..*",
