@@ -35,7 +35,8 @@ bytes only, and check them against the record's digests.
 
 ``sweep.json`` and ``trials.jsonl`` belong together if they have one creation time. So a folder may be renamed
 or copied: the sweep then has the folder's name. To launch it, change ``name`` in its grid, too. A local copy
-of a remote sweep must keep its name, by which ``storage.json`` finds it.
+of a remote sweep must keep its name, by which ``storage.json`` finds it. In one MLflow, a copy that keeps its
+name shares the runs of the original.
 
 A file that is shorter than its committed length, or whose committed bytes have changed, is damaged. Then the
 trial's status is DAMAGED and its data are not used. An attempt moves unusable or replaced files to
@@ -53,6 +54,7 @@ import json
 import os
 import re
 import secrets
+import shlex
 import socket
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -311,7 +313,7 @@ class SweepStore:
                 holder = file.read().strip() or "another process"
                 raise SweepBusyError(
                     f"{self.folder}: this sweep is already being run by {holder}; wait for it, "
-                    "or end it with recrl-sweep stop"
+                    f"or end it with: recrl-sweep stop {shlex.quote(str(self.folder))}"
                 )
             file.truncate(0)
             file.write(f"process {os.getpid()} on {socket.gethostname()}\n")

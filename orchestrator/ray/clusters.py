@@ -34,6 +34,7 @@ from recrl.orchestrator.ray.services import (
 CONNECT_SECONDS = 5.0
 CONNECT_TRIES = 3
 OBJECT_STORE_BYTES = 80 * 2**20  # Ray requires 75 MiB at least; recrl stores nothing of that size
+ADDRESS_VARIABLE = "RAY_ADDRESS"
 TOKEN_VARIABLE = "RAY_AUTH_TOKEN_PATH"
 TOKEN = "token"  # in the cluster's folder
 PREFIX = "recrl-ray-"  # only the next cluster removes such a folder: it ends the processes first
@@ -95,7 +96,7 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[Path]:
             file.write(_token())
         seldom = {f"RAY_{name}": str(value) for name, value in SELDOM.items()}
         with environment(QUIET | WORKER | seldom | {TOKEN_VARIABLE: str(token_path)}):
-            for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"):
+            for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", ADDRESS_VARIABLE):
                 os.environ.pop(name, None)  # Ray uses the mode only if it is set before Ray starts
             with (
                 _leaving_no_process(folder),
@@ -119,7 +120,8 @@ def existing_cluster(address: str, *, ship_package: bool = False) -> Iterator[No
     """Connect to an existing Ray cluster.
 
     Args:
-        address: ``auto`` for the cluster of this machine, or ``host:port``.
+        address: ``auto`` for the cluster that RAY_ADDRESS names or else that of this machine; or
+            ``host:port``.
         ship_package: whether to send recrl itself, without its dependencies, to the nodes.
 
     Raises:
@@ -127,6 +129,9 @@ def existing_cluster(address: str, *, ship_package: bool = False) -> Iterator[No
         ClusterError: there is none, this machine is no node of it, or it refuses our token.
     """
     failure = f"cannot use the Ray cluster at {address}"
+    named = os.environ.get(ADDRESS_VARIABLE, "")
+    if address == "auto" and named not in ("", "auto", "local"):  # Ray would use it without these checks
+        address, failure = named, f"cannot use the Ray cluster of {ADDRESS_VARIABLE}, {named}"
     if "://" in address:  # Ray itself advises against Tune with Ray Client
         raise RecrlError(
             f"{failure}: the driver must run on a node of the cluster, not through Ray Client; "
@@ -142,14 +147,16 @@ def existing_cluster(address: str, *, ship_package: bool = False) -> Iterator[No
             raise ClusterError(f"{failure}: {reason}; is it running, and is this host:port?") from error
     hint = (
         "; is this machine a node of it (ray start --address=<host:port> --num-cpus=0), and does "
-        "it require a token (RAY_AUTH_MODE=token, RAY_AUTH_TOKEN_PATH=<its token file>)?"
+        "it require a token (RAY_AUTH_MODE=token, and the path of its token file in RAY_AUTH_TOKEN_PATH)?"
     )
     with scratch_folder(tempfile.gettempdir()) as scratch:
         runtime_env: dict[str, Any] = {"env_vars": WORKER}
         if ship_package:
             runtime_env["py_modules"] = [str(folder) for folder in copy_package(scratch)]
-        with _connection(failure, hint, address=address, runtime_env=runtime_env):
-            yield
+        with environment({}):
+            os.environ.pop(ADDRESS_VARIABLE, None)  # Ray prefers it to the address ``auto``
+            with _connection(failure, hint, address=address, runtime_env=runtime_env):
+                yield
 
 
 @contextmanager

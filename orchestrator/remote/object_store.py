@@ -50,6 +50,11 @@ class ObjectStore:
         self._root = path.rstrip("/")
         self._is_walked = type(self._system).find is fsspec.AbstractFileSystem.find
 
+    @property
+    def folder(self) -> Path | None:
+        """The folder of the objects, if they are files."""
+        return Path(self._root) if self._in_folder else None
+
     def below(self, folder: str) -> ObjectStore:
         """Return the store of a folder below, over the same connections."""
         child = copy.copy(self)

@@ -134,9 +134,13 @@ class RemoteSweep(SweepPlace):
         """Make the folder the copy of this sweep.
 
         Raises:
-            RecrlError: it is a sweep itself, or the copy of another.
+            RecrlError: it is a sweep itself, the copy of another, or the object store.
         """
         store, known = self.store, remembered_uri(self.store)
+        if self.objects.folder is not None and self.objects.folder.resolve() == store.folder.resolve():
+            raise RecrlError(
+                f"{store.folder}: the object store and its local copy cannot be the same folder; give another --root"
+            )
         if known is None and (store.info_path.exists() or store.trials_folder.exists()):
             raise RecrlError(
                 f"{store.folder}: this sweep is kept in that folder, not at {self.uri}; give another --root, "

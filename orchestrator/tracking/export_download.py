@@ -77,8 +77,10 @@ def _download(uri: str, name: str | None, folder: Path) -> Download:
     sizes = {file.path: file.file_size or 0 for file in client.list_artifacts(run_id, FOLDER)}
     sweep = parent.data.tags.get("recrl.sweep", "")
     if EXPORT not in sizes:
-        missing = f"has no export file of {sweep} yet; recrl-sweep sync {sweep} uploads it"
-        raise TrackingError(f"MLflow at {redacted(uri)} {missing}")
+        raise TrackingError(
+            f"MLflow at {redacted(uri)} has no export file of {sweep}; recrl-sweep sync {sweep} with this "
+            "--tracking-uri uploads it, with --rebuild also if it was there and was deleted"
+        )
     if sizes[EXPORT] > MAX_BYTES:
         raise TrackingError(f"{EXPORT} has {sizes[EXPORT]} bytes, at most {MAX_BYTES} are read")
     at = parent.data.tags.get(UPLOADED_TAG, "an unknown time")

@@ -83,7 +83,7 @@ class ExportUpload:
             self._runs.client.log_artifact(self._runs.parent_id, str(self._path), FOLDER)
         finally:
             self._path.unlink(missing_ok=True)
-        self._runs.client.set_tag(self._runs.parent_id, UPLOADED_TAG, at)
+        self._runs.client.set_tag(self._runs.parent_id, UPLOADED_TAG, at, synchronous=True)
 
 
 def write_in_own_process(store: SweepStore, path: Path) -> None:

@@ -15,7 +15,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.tracking.chart_view import view_tag
-from recrl.orchestrator.tracking.client import EXPERIMENTS, connect, is_server
+from recrl.orchestrator.tracking.client import EXPERIMENTS, connect, is_server, sqlite_path
 from recrl.orchestrator.tracking.positions import Position, file_mark
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class SweepRuns:
         self.parent_id = found or self._create_parent()
         if found is None:  # a user may have deleted the parent only
             for run_id in self._of_trials.values():
-                self.client.set_tag(run_id, "mlflow.parentRunId", self.parent_id)
+                self.client.set_tag(run_id, "mlflow.parentRunId", self.parent_id, synchronous=True)
 
     def of_trial(self, trial_id: str) -> str | None:
         """Return the run of a trial, None if there is none.
@@ -126,9 +126,7 @@ class SweepRuns:
         tags = {"mlflow.experimentKind": "custom_model_development"}
         experiment = self.client.get_experiment_by_name(name)
         if experiment is None:
-            # A server knows its artifact location; for a bare database the default would be the current
-            # folder.
-            place = None if is_server(self._uri) else self._store.mlflow_artifacts.as_uri()
+            place = self._artifact_location()
             return str(self.client.create_experiment(name, artifact_location=place, tags=tags))
         if experiment.lifecycle_stage != "active":
             self.client.restore_experiment(experiment.experiment_id)
@@ -136,6 +134,17 @@ class SweepRuns:
             if experiment.tags.get(key) != value:
                 self.client.set_experiment_tag(experiment.experiment_id, key, value)
         return str(experiment.experiment_id)
+
+    def _artifact_location(self) -> str | None:
+        """Return where a new experiment keeps its files, None if MLflow's server knows.
+
+        For a bare database MLflow's default would be the current folder. Sweeps of one name may share an
+        experiment, so its files are beside the database, not in a folder of one of the sweeps.
+        """
+        if is_server(self._uri):
+            return None
+        database = sqlite_path(self._uri)
+        return (database.parent / "mlartifacts" if database else self._store.mlflow_artifacts).as_uri()
 
     def _offer_charts(self) -> None:
         """Store the view of the charts; a server that refuses so long a tag still gets the runs."""

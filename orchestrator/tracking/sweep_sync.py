@@ -80,7 +80,8 @@ class SweepSync:
             report_text=self._report_text(),
         )
         if position.shown.get("note") != text:
-            self._runs.client.log_batch(position.run_id, tags=[RunTag("mlflow.note.content", text)])
+            tags = [RunTag("mlflow.note.content", text)]
+            self._runs.client.log_batch(position.run_id, tags=tags, synchronous=True)
         if position.shown.get("status") != status:
             last = max((record.heartbeat for record in records.values()), default=0.0)
             self._runs.set_status(position.run_id, status, last or time.time())

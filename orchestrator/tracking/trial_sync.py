@@ -98,7 +98,7 @@ class TrialSync:
         if position.shown != shown:
             client, run_id = self._runs.client, position.run_id
             tags = [RunTag(key, value) for key, value in state_tags(record).items()]
-            client.log_batch(run_id, tags=tags)
+            client.log_batch(run_id, tags=tags, synchronous=True)
             self._runs.delete_tags(run_id, {"recrl.verdict", "mlflow.note.content"})
             self._runs.set_status(run_id, "FAILED", record.heartbeat or time.time())
             self._save(trial, replace(position, shown=shown))
@@ -129,7 +129,7 @@ class TrialSync:
             for path in _added_afterwards(trial):
                 position = self._runs.send_files(position, [path], path.parent.name)
         except OSError:  # points may fit even if there is no room for files
-            client.log_batch(run_id, metrics=metrics, params=new_params)
+            client.log_batch(run_id, metrics=metrics, params=new_params, synchronous=True)
             raise
         tag_values = {**state_tags(record), GROUP_TAG: group}
         if outcome is not None:
@@ -137,7 +137,7 @@ class TrialSync:
             text = trial_note(outcome, [float(limit) for limit in start])
             tag_values |= {"recrl.verdict": outcome.verdict, "mlflow.note.content": text}
         tags = [RunTag(key, value) for key, value in tag_values.items()]
-        client.log_batch(run_id, metrics=metrics, params=new_params, tags=tags)
+        client.log_batch(run_id, metrics=metrics, params=new_params, tags=tags, synchronous=True)
         self._runs.without_params.discard(run_id)
         if position.shown.get("error") and not record.error:
             self._runs.delete_tags(run_id, {"recrl.error"})

@@ -152,7 +152,7 @@ def test_a_sweep_that_runs_is_uploaded_at_intervals(
     uri = tracking_uri(store, None)
     tracker = Tracker(store, uri, write)
     tracker.bring_up_to_date(live=True)
-    with pytest.raises(TrackingError, match="has no export file of made-up yet; recrl-sweep sync made-up"):
+    with pytest.raises(TrackingError, match="has no export file of made-up; recrl-sweep sync made-up"):
         from_mlflow.load(uri, "made-up")
     monkeypatch.setattr(export_file, "INTERVAL_SECONDS", 0.0)
     tracker = Tracker(store, uri, write)

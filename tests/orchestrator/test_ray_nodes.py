@@ -1,5 +1,6 @@
 """A launch on somebody else's cluster is refused in one sentence where it cannot go well."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from recrl.orchestrator.cli.main import main
-from recrl.orchestrator.errors import GridError, RecrlError
+from recrl.orchestrator.errors import ClusterError, GridError, RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.provenance.own_package import copy_package, source_digest
@@ -86,6 +87,22 @@ def test_ray_client_is_refused() -> None:
     ):
         pass
     assert type(caught.value) is RecrlError  # a wrong argument, and not a cluster that is away
+
+
+@pytest.mark.parametrize(
+    ("named", "error", "sentence"),
+    [
+        ("ray://head:10001", RecrlError, r"of RAY_ADDRESS, ray://head:10001: the driver must run on a node"),
+        ("127.0.0.1:1", ClusterError, r"of RAY_ADDRESS, 127\.0\.0\.1:1: .*refused; is it running"),
+    ],
+)
+def test_the_address_of_the_environment_is_checked_before_ray_uses_it(
+    named: str, error: type[Exception], sentence: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", named)
+    with pytest.raises(error, match=f"^cannot use the Ray cluster {sentence}"), existing_cluster("auto"):
+        pass
+    assert os.environ["RAY_ADDRESS"] == named
 
 
 def test_an_address_of_ray_client_is_a_wrong_argument(

@@ -7,11 +7,12 @@ import math
 import os
 import shutil
 import socket
+import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -654,6 +655,32 @@ def test_a_run_whose_maker_died_over_it_gets_its_params(write: Callable[..., Swe
     assert sync(store, uri).is_up_to_date
     assert runs(store)[NONE].info.run_id == half.info.run_id
     assert runs(store)[NONE].data.params == shown.data.params
+
+
+def test_a_refused_write_is_noticed_also_if_the_user_logs_asynchronously(
+    write: Callable[..., SweepStore], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MLFLOW_ENABLE_ASYNC_LOGGING", "true")
+    store = write()
+    uri = tracking_uri(store, None)
+    connect(store).search_experiments()  # makes the tables
+    with closing(sqlite3.connect(store.mlflow_database)) as database:
+        database.execute(
+            "CREATE TRIGGER refuse BEFORE INSERT ON metrics BEGIN SELECT RAISE(ABORT, 'disk trouble'); END"
+        )
+        report = sync(store, uri)
+        assert not report.is_up_to_date
+        assert "disk trouble" in report.problem
+        database.execute("DROP TRIGGER refuse")
+        assert sync(store, uri).is_up_to_date
+    assert history(store, runs(store)[NONE])["train/return"]
+
+
+def test_the_files_of_a_shared_database_are_beside_it(write: Callable[..., SweepStore], tmp_path: Path) -> None:
+    store = write()
+    assert sync(store, f"sqlite:///{tmp_path}/shared/mlflow.db").is_up_to_date
+    assert (tmp_path / "shared" / "mlartifacts").is_dir()
+    assert not store.mlflow_artifacts.exists()
 
 
 def test_where_files_do_not_fit_the_curves_are_there(write: Callable[..., SweepStore]) -> None:

@@ -236,7 +236,8 @@ def test_state_is_strict_json(store: TrialStore) -> None:
 
 def test_one_process_at_a_time_runs_a_sweep(tmp_path: Path) -> None:
     store = SweepStore(tmp_path, "sweep")
-    with store.lock(), pytest.raises(SweepBusyError, match="already being run by process"), store.lock():
+    sentence = rf"already being run by process .*; .* end it with: recrl-sweep stop {store.folder}$"
+    with store.lock(), pytest.raises(SweepBusyError, match=sentence), store.lock():
         pass
     with store.lock():
         pass
