@@ -30,6 +30,7 @@ import copy
 import functools
 import zlib
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import gymnasium
@@ -72,7 +73,23 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         if not factories:
             raise ValueError(f"{name}: num_envs must be at least 1, got 0")
         self.num_envs = len(factories)
-        self._environments = [made_environment(name, factory) for factory in factories]
+        self._environments: list[Environment] = []
+        try:
+            for factory in factories:
+                self._environments.append(made_environment(name, factory))
+            self._describe(name, cost_names)
+        except BaseException:
+            with suppress(Exception):  # the first error says more
+                self.close_extras()
+            raise
+        self._costless = costless
+        self._episode_seeds = [0] * self.num_envs
+        self._episode_actions: list[list[Any]] = [[] for _ in range(self.num_envs)]
+        self._checksums = [0] * self.num_envs
+        self._observations: npt.NDArray[np.float32] | None = None
+
+    def _describe(self, name: str, cost_names: Sequence[str] | None) -> None:
+        """Set the spaces and the CMDP."""
         if len({id(each.unwrapped) for each in self._environments}) < self.num_envs:
             raise ValueError(f"{name} must return a new environment each time")
         first = self._environments[0]
@@ -95,11 +112,6 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             _declared_horizon(first),
             _declared_components(first),
         )
-        self._costless = costless
-        self._episode_seeds = [0] * self.num_envs
-        self._episode_actions: list[list[Any]] = [[] for _ in range(self.num_envs)]
-        self._checksums = [0] * self.num_envs
-        self._observations: npt.NDArray[np.float32] | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -154,9 +166,10 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         return tuple(environment.render() for environment in self._environments)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the environments."""
-        for environment in self._environments:
-            environment.close()
+        """Close all environments, also if one of them raises an error."""
+        with ExitStack() as stack:
+            for environment in self._environments:
+                stack.callback(environment.close)
 
     def state_dict(self) -> dict[str, Any]:
         """Return seed, actions, checksum and last observation of every episode, and the generator."""

@@ -17,7 +17,6 @@ import os
 import re
 import sys
 import threading
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
@@ -49,7 +48,6 @@ _refused = ContextVar("_refused", default=False)  # of a thread: others may foll
 # Folders of modules: that of the parent process, and those of the open blocks of ``modules_in``.
 _folders = [os.environ[MODULES]] if MODULES in os.environ else []
 _appended: set[str] = set()  # folders that import_module has appended to sys.path
-_imported: dict[str, tuple[ModuleSpec, bytes]] = {}  # by a module's name: how it was found, and its source
 _changing = threading.Lock()
 
 
@@ -130,9 +128,6 @@ def modules_folder() -> str | None:
 def import_module(name: str) -> ModuleType:
     """Import a module by its dotted name, also from the folder of ``modules_in``.
 
-    If the file of a module has changed since this process imported it, that is a warning: the code of before
-    runs.
-
     Raises:
         ImportError: it cannot be imported; or this process imported it from another folder than the one in
             which it is found now.
@@ -144,7 +139,6 @@ def import_module(name: str) -> ModuleType:
             _appended.add(folder)
     module = importlib.import_module(name)
     _require_same_place(name.partition(".")[0])
-    _warn_if_changed(module)
     return module
 
 
@@ -158,24 +152,6 @@ def _require_same_place(package: str) -> None:
         raise ImportError(
             f"this process imported {package} from {spec.origin}, and now {found.origin} is found; start a "
             "new Python process"
-        )
-
-
-def _warn_if_changed(module: ModuleType) -> None:
-    """Warn if the file of a module has changed since this process imported it."""
-    name, spec = module.__name__, module.__spec__
-    if spec is None or spec.origin is None or not Path(spec.origin).is_file():
-        return
-    now = Path(spec.origin).read_bytes()
-    imported, source = _imported.get(name, (spec, now))
-    if imported is not spec:  # it was reloaded
-        source = now
-    _imported[name] = (spec, source)
-    if source != now:
-        warnings.warn(
-            f"{spec.origin} has changed since this process imported it; the code of before runs until you "
-            f"start a new Python process or call importlib.reload(sys.modules[{name!r}])",
-            stacklevel=3,
         )
 
 

@@ -221,7 +221,7 @@ def _legend(
     panels.legend_below(figure, references)
     title = "final policies, one mark per run: filled if feasible, hollow if not"
     if len(methods) > 1:
-        title += "\nsmaller marks only show runs that are equal"
+        title += "\nmarks differ in size only so that equal runs are visible"
     if clipped:
         title += "\nmarks on the right edge: the cost is beyond the axis"
     panels.legend_above(

@@ -20,9 +20,15 @@ import pandas as pd
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.trial_reader import TrialReader
-from recrl.orchestrator.spec import Choice
+from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.teachers.registry import make_teacher
-from recrl.teachers.teacher import ProgressReport, TeacherSpec
+from recrl.teachers.teacher import (
+    ProgressReport,
+    TeacherSpec,
+    TeacherState,
+    check_limits_fall,
+    checked_answer,
+)
 
 
 def replay(trial: TrialReader, method: Choice) -> pd.DataFrame:
@@ -39,6 +45,7 @@ def replay(trial: TrialReader, method: Choice) -> pd.DataFrame:
         RecrlError: the run has no update yet.
         UnknownNameError: the curriculum is not known.
         pydantic.ValidationError: its options are wrong.
+        TypeError, ValueError: it gives an answer that a trial would refuse.
     """
     updates = trial.updates()
     if not len(updates):
@@ -47,12 +54,13 @@ def replay(trial: TrialReader, method: Choice) -> pd.DataFrame:
     teacher = make_teacher(
         TeacherSpec(method.name, method.options, spec.train_limits, spec.deploy_limits, spec.train_steps)
     )
-    step, state = teacher.start()
+    step, state = _checked(teacher.start(), spec, method, before=None, update=0)
     steps = []
     for report in progress_reports(trial, updates):
         steps.append(step)
         if report.env_steps < spec.train_steps:
-            step, state = teacher.step(state, report)
+            answer = teacher.step(state, report)
+            step, state = _checked(answer, spec, method, before=step.limits, update=report.update)
         else:
             step = CurriculumStep(spec.deploy_limits)
     costs = range(len(spec.deploy_limits))
@@ -60,6 +68,24 @@ def replay(trial: TrialReader, method: Choice) -> pd.DataFrame:
     columns = ["update", "phase", "end_step", *recorded, "noise"]
     limits = {f"replayed_limit_{i}": [each.limits[i] for each in steps] for i in costs}
     return updates[columns].assign(**limits, replayed_noise=[each.policy_noise for each in steps])
+
+
+def _checked(
+    answer: object, spec: TrialSpec, method: Choice, *, before: CostLimits | None, update: int
+) -> tuple[CurriculumStep, TeacherState]:
+    """Check a curriculum's answer as a trial does."""
+    num_costs = len(spec.deploy_limits)
+    step, state = checked_answer(answer, method.label, num_costs)
+    check_limits_fall(
+        step,
+        before,
+        spec.train_limits,
+        deploy_limits=spec.deploy_limits,
+        curriculum=method.label,
+        cost_names=[f"cost {i}" for i in range(num_costs)],
+        update=update,
+    )
+    return step, state
 
 
 def progress_reports(trial: TrialReader, updates: pd.DataFrame) -> Iterator[ProgressReport]:

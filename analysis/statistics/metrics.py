@@ -122,8 +122,9 @@ def summary(rows: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
     Returns:
         GROUP, measure, seeds (complete trials), failed (failed trials), then mean and standard error
         (``_se``) of episode_return, cost_i and gap, deploy_limit_i, optimal_return, exact (whether every seed
-        is; false without one); feasible_seeds and their share of the complete and failed trials, feasible_share, with Wilson's 95% interval (feasible_low,
-        feasible_high); optimal_seeds with Wilson's interval of their share (optimal_low, optimal_high).
+        is; false without one); feasible_seeds and their share of the complete and failed trials,
+        feasible_share, with Wilson's 95% interval (feasible_low, feasible_high); optimal_seeds with Wilson's
+        interval of their share (optimal_low, optimal_high).
         Groups without a complete or failed trial are left out.
     """
     names = [str(name) for name in rows]

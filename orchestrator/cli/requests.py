@@ -102,8 +102,8 @@ class LaunchRequest(GridRequest):
     address: str | None = by_flag(
         type=types.not_empty,
         metavar="HOST:PORT",
-        help="an existing Ray cluster that this machine is a node of, or 'auto' for that of RAY_ADDRESS, else "
-        "for the one that is found; by default one is started here",
+        help="an existing Ray cluster that this machine is a node of; auto: that of RAY_ADDRESS, else "
+        "the one that is found; by default one is started here",
     )
     tracking_uri: str | None = by_flag(**_TRACKING)
     executor: str = by_flag(

@@ -38,25 +38,39 @@ def cmdp_of(task: Choice) -> CMDPSpec:
     """Return the task's CMDP, by building one environment; a user's environment also takes one step.
 
     Raises:
-        BuildError: it cannot be built, or fails in its first step.
+        BuildError: it cannot be built, fails in its first step, or does not begin anew with a reset.
     """
     try:
         envs = make_vector(task.name, 1, options=task.options)
     except USERS_ERRORS as error:
         raise BuildError(f"{task.name} cannot be built: {described_with_place(error)}") from error
     try:
-        if isinstance(envs, SyncCMDPVectorEnv):  # a user's environment: does a step report its cost?
-            envs.reset(seed=0)
-            envs.action_space.seed(0)
-            envs.step(envs.action_space.sample())
-    except USERS_ERRORS as error:
-        raise BuildError(f"{task.name} fails in its first step: {described_with_place(error)}") from error
+        if isinstance(envs, SyncCMDPVectorEnv):  # a user's environment
+            _try_out(task.name, envs)
     finally:
         try:
             envs.close()
         except USERS_ERRORS as error:  # in a trial it is only logged
             logger.warning("%s raised an error when it was closed: %s", task.name, described(error))
     return envs.cmdp
+
+
+def _try_out(name: str, envs: SyncCMDPVectorEnv) -> None:
+    """Take a step, and repeat it after another reset.
+
+    A wrapper that learns from observations or rewards would give other numbers. Then later episodes are not
+    those that a new environment has, with which a trial is resumed and its policy is evaluated.
+    """
+    try:
+        envs.reset(seed=0)
+        envs.action_space.seed(0)
+        envs.step(envs.action_space.sample())
+    except USERS_ERRORS as error:
+        raise BuildError(f"{name} fails in its first step: {described_with_place(error)}") from error
+    try:
+        envs.load_state_dict(envs.state_dict())
+    except USERS_ERRORS as error:
+        raise BuildError(f"{name} does not begin anew with a reset: {described_with_place(error)}") from error
 
 
 def build_own(grid: GridSpec, cmdps: Mapping[str, CMDPSpec]) -> Iterator[tuple[Place, str, str]]:

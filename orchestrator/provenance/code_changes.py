@@ -13,10 +13,13 @@ most new versions change nothing, or only the rounding.
 from __future__ import annotations
 
 import functools
+import os
+import struct
 import sys
+import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
-from importlib.machinery import ModuleSpec
+from importlib.machinery import ModuleSpec, SourceFileLoader
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -90,10 +93,17 @@ class InstalledCode:
 def code_of(spec: TrialSpec) -> dict[str, str]:
     """Return ``InstalledCode.of`` a trial that this process runs now.
 
-    A process imports a package once. If its files have changed since, ``CHANGED`` is in place of a digest, so
-    that the trial counts as one of other code.
+    A process imports a package once. If its files have changed since, that is a warning, and ``CHANGED`` is
+    in place of a digest, so that the trial counts as one of other code.
     """
-    return InstalledCode(_digests_of_imported).of(spec)
+    found = InstalledCode(_digests_of_imported).of(spec)
+    if changed := [name for name, digest in found.items() if digest == CHANGED]:
+        warnings.warn(
+            f"the code of {', '.join(changed)} has changed since this process imported it; the code of "
+            "before runs until you start a new Python process or reload the modules",
+            stacklevel=2,
+        )
+    return found
 
 
 @dataclass(frozen=True)
@@ -197,12 +207,35 @@ def _digests_of_imported(package: str) -> dict[str, str]:
     """
     digests, place = _digests_of(package), (package, folder_of_files(files_of(package)))
     imported = _imported_of(digests.keys() | {package})
-    before, first = _ran.get(place, (imported, digests))
+    before, first = _ran.get(place) or (imported, _without_edited(digests, imported))
     are_reloaded = bool(before) and all(imported.get(name) is not spec for name, spec in before.items())
     if digests == first or are_reloaded:
         _ran[place] = (imported, digests)
         return digests
     return {name: digest if digest == first.get(name) else CHANGED for name, digest in digests.items()}
+
+
+def _without_edited(digests: Mapping[str, str], imported: Mapping[str, ModuleSpec | None]) -> dict[str, str]:
+    """Return digests with ``CHANGED`` where a file was edited between its import and the first look at it."""
+    edited = {name.partition(".")[0] for name, spec in imported.items() if spec and _is_edited(spec)}
+    return {name: CHANGED if name in edited else digest for name, digest in digests.items()}
+
+
+def _is_edited(spec: ModuleSpec) -> bool:
+    """Whether Python's compiled file of an imported module is not of its source as it is now.
+
+    At an import Python writes that file, with time and size of the source in bytes 8 to 16. Where it writes
+    none, the answer is no.
+    """
+    writes = not sys.dont_write_bytecode and type(spec.loader) is SourceFileLoader
+    if not writes or not spec.cached or not spec.origin or not os.access(Path(spec.cached).parent, os.W_OK):
+        return False
+    try:
+        head, source = Path(spec.cached).read_bytes()[:16], os.stat(spec.origin)
+    except OSError:
+        return False
+    mark = struct.pack("<II", int(source.st_mtime) & 0xFFFFFFFF, source.st_size & 0xFFFFFFFF)
+    return head[4:8] == bytes(4) and head[8:] != mark  # with other flags, a digest is in place of both
 
 
 def _imported_of(packages: Collection[str]) -> dict[str, ModuleSpec | None]:

@@ -139,7 +139,8 @@ class RemoteSweep(SweepPlace):
         store, known = self.store, remembered_uri(self.store)
         if self.objects.folder is not None and self.objects.folder.resolve() == store.folder.resolve():
             raise RecrlError(
-                f"{store.folder}: the object store and its local copy cannot be the same folder; give another --root"
+                f"{store.folder}: the object store and its local copy cannot be the same folder; give "
+                "another --root"
             )
         if known is None and (store.info_path.exists() or store.trials_folder.exists()):
             raise RecrlError(

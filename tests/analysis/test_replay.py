@@ -105,6 +105,43 @@ def test_when_the_limit_arrives_is_a_share_of_the_whole_training_phase(trial: Tr
     assert arrival(rows) == "at its end"
 
 
+RISING = """
+from pydantic import BaseModel
+
+from recrl.environments.cmdp import CostLimits, CurriculumStep
+from recrl.teachers.registry import TeacherKind
+
+
+class Options(BaseModel):
+    pass
+
+
+class Rising:
+    def __init__(self, spec):
+        pass
+
+    def start(self):
+        return CurriculumStep(CostLimits((2.0,))), {"update": 0}
+
+    def step(self, state, report):
+        return CurriculumStep(CostLimits((2.0 + report.update,))), {"update": report.update}
+
+
+KIND = TeacherKind("Rises.", Options, Rising)
+"""
+
+
+def test_an_answer_that_a_trial_would_refuse_is_refused(
+    trial: TrialStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_rising.py").write_text(RISING)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(
+        ValueError, match=r"own_rising:KIND: the limit of cost 0 rose from 2 to 3 after update 1"
+    ):
+        replay(trial, Choice("own_rising:KIND"))
+
+
 def test_a_run_without_updates_cannot_be_replayed(tmp_path: Path) -> None:
     store = SweepStore(tmp_path, "sweep").trial(SPEC)
     store.begin(SPEC)

@@ -616,6 +616,28 @@ def test_a_factory_that_makes_no_environment_is_named() -> None:
         SyncCMDPVectorEnv("os:getpid", [lambda: 3])  # type: ignore[list-item, return-value]
 
 
+class Closing(Countdown):
+    """Counts those that are closed; one of three raises an error."""
+
+    closed = 0
+
+    def close(self) -> None:
+        type(self).closed += 1
+        if self.closed == 2:
+            raise OSError("no port")
+
+
+def test_all_environments_are_closed_also_if_one_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Closing, "closed", 0)
+    environment = SyncCMDPVectorEnv("closing", [Closing] * 3)
+    with pytest.raises(OSError, match="no port"):
+        environment.close()
+    assert Closing.closed == 3
+    with pytest.raises(ValueError, match="must return a Gymnasium environment"):
+        SyncCMDPVectorEnv("closing", [Closing, Closing, lambda: 3])  # type: ignore[list-item, return-value]
+    assert Closing.closed == 5
+
+
 def test_a_factory_that_returns_the_same_environment_twice_is_named() -> None:
     one = Countdown()
     with pytest.raises(ValueError, match=r"^one:make must return a new environment each time$"):

@@ -344,18 +344,40 @@ def test_a_process_that_goes_on_with_the_code_of_before_says_so(folder: Path) ->
     (spec,) = read_grid(folder / "grid.yaml").trials()
     sys.modules.pop("my_scaled_task", None)
     before = code_of(spec)
-    import_module("my_scaled_task")
+    module = import_module("my_scaled_task")
     assert code_of(spec) == before
     (folder / "my_scaled_task.py").write_text(TASK + "LATER = 1\n")
-    with pytest.warns(UserWarning, match="has changed since this process imported it"):
-        module = import_module("my_scaled_task")
-    assert code_of(spec) == {**before, "my_scaled_task": CHANGED}
-    assert compare([{"code": code_of(spec)}], spec).differs, (
-        "a later launch says that the code is another one"
-    )
+    with pytest.warns(
+        UserWarning, match="the code of my_scaled_task has changed since this process imported"
+    ):
+        changed = code_of(spec)
+    assert changed == {**before, "my_scaled_task": CHANGED}
+    assert compare([{"code": changed}], spec).differs, "a later launch says that the code is another one"
     importlib.reload(module)
-    import_module("my_scaled_task")
     assert code_of(spec) == InstalledCode().of(spec) != before
+
+
+def test_an_edit_between_an_import_and_the_first_trial_is_seen(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    (spec,) = read_grid(folder / "grid.yaml").trials()
+    (folder / "my_helper.py").write_text("REWARD = 1\n")
+    (folder / "my_scaled_task.py").write_text(f"import my_helper\n{TASK}")
+    for name in ("my_scaled_task", "my_helper"):
+        sys.modules.pop(name, None)
+    importlib.invalidate_caches()
+    module = importlib.import_module("my_scaled_task")
+    (folder / "my_helper.py").write_text("REWARD = 1000\n")
+    for _ in range(2):
+        with pytest.warns(
+            UserWarning, match="the code of my_helper has changed since this process imported it"
+        ):
+            assert code_of(spec) == {**InstalledCode().of(spec), "my_helper": CHANGED}
+    for name in ("my_helper", "my_scaled_task"):
+        importlib.reload(sys.modules[name])
+    assert code_of(spec) == InstalledCode().of(spec)
+    assert module.my_helper.REWARD == 1000
 
 
 def test_modules_that_a_plug_in_imports_are_among_its_code(folder: Path) -> None:

@@ -41,6 +41,20 @@ class Unseeded(Room):
         return np.random.default_rng().uniform(-1.0, 1.0, 2).astype(np.float32), info
 
 
+class Worn(Room):
+    """Its rewards depend on the number of past episodes, like those of a wrapper that learns a scale."""
+
+    episodes = 0
+
+    def reset(self, *, seed=None, options=None):
+        self.episodes += 1
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        return observation, 1.0 / self.episodes, *rest
+
+
 class Broken(Room):
     def step(self, action):
         observation, reward, terminated, truncated, info = super().step(action)
@@ -255,6 +269,15 @@ def test_a_task_whose_episodes_do_not_follow_from_their_seed() -> None:
     (problem,) = problems(task="own_rehearsed:Unseeded", agents=["cpo", "own_rehearsed:COUNTER"])
     assert problem.startswith("grid.yaml:2: tasks.0: own_rehearsed:Unseeded ")
     assert "reset(seed=...)" in problem
+
+
+def test_a_task_whose_episodes_depend_on_those_before() -> None:
+    (problem,) = problems(task="own_rehearsed:Worn")
+    assert problem == (
+        "grid.yaml:2: tasks.0: own_rehearsed:Worn does not begin anew with a reset: ValueError: "
+        "own_rehearsed:Worn: cannot be resumed, because replaying the episode of environment 0 gave other "
+        "observations, rewards, costs or ends on the way; reset(seed=...) must determine an episode"
+    )
 
 
 def test_a_task_that_fails_after_its_first_step() -> None:

@@ -553,7 +553,9 @@ def test_a_folder_of_objects_is_not_its_own_local_copy(tmp_path: Path) -> None:
     """Deleting a damaged local copy would delete the sweep."""
     (tmp_path / "runs").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "runs")
-    with pytest.raises(RecrlError, match=r"runs/small: the object store and its local copy cannot be the same"):
+    with pytest.raises(
+        RecrlError, match=r"runs/small: the object store and its local copy cannot be the same"
+    ):
         RemoteSweep(f"file://{tmp_path}/link", SweepStore(tmp_path / "runs", "small")).mark()
     assert not (tmp_path / "runs" / "small").exists()
     RemoteSweep(f"file://{tmp_path}/link/inside", SweepStore(tmp_path / "runs", "small")).mark()

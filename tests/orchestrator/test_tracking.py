@@ -676,7 +676,9 @@ def test_a_refused_write_is_noticed_also_if_the_user_logs_asynchronously(
     assert history(store, runs(store)[NONE])["train/return"]
 
 
-def test_the_files_of_a_shared_database_are_beside_it(write: Callable[..., SweepStore], tmp_path: Path) -> None:
+def test_the_files_of_a_shared_database_are_beside_it(
+    write: Callable[..., SweepStore], tmp_path: Path
+) -> None:
     store = write()
     assert sync(store, f"sqlite:///{tmp_path}/shared/mlflow.db").is_up_to_date
     assert (tmp_path / "shared" / "mlartifacts").is_dir()
