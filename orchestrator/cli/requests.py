@@ -103,7 +103,7 @@ class LaunchRequest(GridRequest):
         type=types.not_empty,
         metavar="HOST:PORT",
         help="an existing Ray cluster that this machine is a node of; auto: that of RAY_ADDRESS, else "
-        "the one that is found; by default one is started here",
+        "this machine's; by default one is started here",
     )
     tracking_uri: str | None = by_flag(**_TRACKING)
     executor: str = by_flag(

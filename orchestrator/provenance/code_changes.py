@@ -93,7 +93,7 @@ class InstalledCode:
 def code_of(spec: TrialSpec) -> dict[str, str]:
     """Return ``InstalledCode.of`` a trial that this process runs now.
 
-    A process imports a package once. If its files have changed since, that is a warning, and ``CHANGED`` is
+    A process imports a package once. If its files have changed since, that is a warning. Then ``CHANGED`` is
     in place of a digest, so that the trial counts as one of other code.
     """
     found = InstalledCode(_digests_of_imported).of(spec)

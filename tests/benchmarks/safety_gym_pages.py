@@ -57,9 +57,9 @@ def of_cell(rows: pd.DataFrame, task: str, method: str) -> pd.DataFrame:
     return rows[(rows["agent"] == "ppo-lag") & (rows["task"] == task) & (rows["method"] == method)]
 
 
-def of_question(rows: pd.DataFrame, methods: Sequence[str]) -> pd.DataFrame:
-    """Return the rows of ppo-lag on CarGoal2 under some curricula."""
-    chosen = (rows["task"] == "CarGoal2") & (rows["agent"] == "ppo-lag")
+def of_question(rows: pd.DataFrame, methods: Sequence[str], tasks: Sequence[str] = TASKS[:1]) -> pd.DataFrame:
+    """Return the rows of ppo-lag on some tasks, by default CarGoal2, under some curricula."""
+    chosen = rows["task"].isin(tasks) & (rows["agent"] == "ppo-lag")
     return rows[chosen & rows["method"].isin(methods)]
 
 
@@ -213,7 +213,7 @@ def tables() -> Iterator[tuple[Path, str, list[str]]]:
         (DETAILS, "deployment phase", deployment_phase(phase)),
         *((DETAILS, name, policies(rows_of(f"{name}.csv"))) for name in (*CONFIRMATIONS, LEVEL_1)),
         (DETAILS, "steps under the limit", policies(of_question(everything, STEPS_UNDER_LIMIT))),
-        (DETAILS, "noise", policies(of_question(current, NOISE))),
+        (DETAILS, "noise", policies(of_question(current, NOISE, TASKS))),
     )
     for page, name, lines in drawn:
         yield page, name, list(lines)

@@ -37,6 +37,7 @@ from tests.benchmarks.safety_gym_pages import (
     RESULTS,
     ROOT,
     STEPS_UNDER_LIMIT,
+    TASKS,
     of_policy,
     of_question,
     rows_of,
@@ -170,11 +171,15 @@ def main() -> None:
     multipliers(updates).round(4).to_csv(RESULTS / MULTIPLIERS, index=False)
     controls = [f"{name}.csv" for name in CONTROLS]
     questions = (
-        ("steps-under-limit", rows_of(*PILOT, FRESH, *controls), STEPS_UNDER_LIMIT, ("none", "linear")),
-        ("noise", rows_of(FRESH, *controls), NOISE, ("none", "dynamic")),
+        (
+            "steps-under-limit",
+            of_question(rows_of(*PILOT, FRESH, *controls), STEPS_UNDER_LIMIT),
+            ("none", "linear"),
+        ),
+        ("noise", of_question(rows_of(FRESH, *controls), NOISE, TASKS), ("none", "dynamic")),
     )
-    for name, rows, methods, baselines in questions:
-        lines = control_differences(of_question(rows, methods), baselines)
+    for name, rows, baselines in questions:
+        lines = control_differences(rows, baselines)
         (RESULTS / f"{name}.txt").write_text("\n".join([*lines, ""]))
     counts: list[str] = []
     for names in ((FRESH,), (*PILOT, FRESH)):
