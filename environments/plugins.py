@@ -13,17 +13,19 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
+import marshal
 import os
 import re
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
-from importlib.machinery import ModuleSpec, PathFinder
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any
 
 
@@ -43,6 +45,7 @@ class UntrustedNameError(Exception):
 
 
 IMPORT_PATH = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")
+BYTECODE_HEADER = 16  # bytes
 MODULES = "RECRL_MODULES"  # an environment variable: a folder of modules, searched last
 _refused = ContextVar("_refused", default=False)  # of a thread: others may follow import paths meanwhile
 # Folders of modules: that of the parent process, and those of the open blocks of ``modules_in``.
@@ -128,6 +131,9 @@ def modules_folder() -> str | None:
 def import_module(name: str) -> ModuleType:
     """Import a module by its dotted name, also from the folder of ``modules_in``.
 
+    If the user's module ``is_edited`` since this process imported it, that is a warning: the code of before
+    runs.
+
     Raises:
         ImportError: it cannot be imported; or this process imported it from another folder than the one in
             which it is found now.
@@ -139,7 +145,45 @@ def import_module(name: str) -> ModuleType:
             _appended.add(folder)
     module = importlib.import_module(name)
     _require_same_place(name.partition(".")[0])
+    if not name.startswith("recrl.") and module.__spec__ is not None and is_edited(module.__spec__):
+        warnings.warn(
+            f"{module.__spec__.origin} has changed since this process imported it; the code of before runs "
+            f"until you start a new Python process or call importlib.reload(sys.modules[{name!r}])",
+            stacklevel=2,
+        )
     return module
+
+
+def is_edited(spec: ModuleSpec) -> bool:
+    """Whether the source of an imported module has other code now than at the import.
+
+    It is compared with the bytecode that Python then wrote or read. Where Python writes none, the answer is
+    no. So it is if another process has imported the module since.
+    """
+    writes = not sys.dont_write_bytecode and type(spec.loader) is SourceFileLoader
+    if not writes or not spec.cached or not spec.origin or not os.access(Path(spec.cached).parent, os.W_OK):
+        return False
+    try:
+        imported = marshal.loads(Path(spec.cached).read_bytes()[BYTECODE_HEADER:])
+        return not _is_same_code(
+            imported, compile(Path(spec.origin).read_bytes(), spec.origin, "exec", dont_inherit=True)
+        )
+    except SyntaxError:  # it is being edited
+        return True
+    except (EOFError, OSError, TypeError, ValueError):
+        return False
+
+
+def _is_same_code(one: Any, other: Any) -> bool:
+    """Compare two code objects, or constants of code, but for the numbers of lines."""
+    if not isinstance(one, CodeType) or not isinstance(other, CodeType):
+        return type(one) is type(other) and bool(one == other)
+    parts = ("co_code", "co_names", "co_varnames", "co_freevars", "co_cellvars")
+    return (
+        all(getattr(one, part) == getattr(other, part) for part in parts)
+        and len(one.co_consts) == len(other.co_consts)
+        and all(map(_is_same_code, one.co_consts, other.co_consts))
+    )
 
 
 def _require_same_place(package: str) -> None:

@@ -50,7 +50,8 @@ def with_error(mean: float, error: float, *, digits: int = 2) -> str:
 def cost_with_error(mean: float, error: float, *, exact: bool) -> str:
     """Format the mean cost of policies as ``with_error`` does.
 
-    An exact cost has three digits, because it is compared with a limit to within 1%.
+    An exact cost has three digits, because it is compared with a limit to within 1%. So has one near 0: a
+    limit of 0 may be exceeded by 0.01.
 
     Args:
         mean: NaN becomes a dash.
@@ -59,5 +60,7 @@ def cost_with_error(mean: float, error: float, *, exact: bool) -> str:
 
     >>> cost_with_error(5.002, 0.001, exact=True), cost_with_error(33.477, 7.471, exact=False)
     ('5.002 ± 0.001', '33.48 ± 7.47')
+    >>> cost_with_error(0.0142, 0.0011, exact=False)
+    '0.014 ± 0.001'
     """
-    return with_error(mean, error, digits=3 if exact else 2)
+    return with_error(mean, error, digits=3 if exact or abs(mean) < 0.1 else 2)

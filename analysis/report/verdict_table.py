@@ -48,7 +48,9 @@ def verdict_table(verdicts: pd.DataFrame) -> pd.DataFrame:
         line[DIFFERENCE] = _gain_text(row)
         line["n"] = str(row["seeds"])
         earned = with_error(row["deployment_return"], row["deployment_return_se"])
-        paid = [with_error(row[f"deployment_{it}"], row[f"deployment_{it}_se"]) for it in costs]
+        paid = [
+            cost_with_error(row[f"deployment_{it}"], row[f"deployment_{it}_se"], exact=False) for it in costs
+        ]
         line[DEPLOYMENT] = f"return {earned}, cost {', '.join(paid)}"
         lines.append(line)
     return pd.DataFrame(lines)

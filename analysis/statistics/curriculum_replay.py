@@ -45,7 +45,7 @@ def replay(trial: TrialReader, method: Choice) -> pd.DataFrame:
         RecrlError: the run has no update yet.
         UnknownNameError: the curriculum is not known.
         pydantic.ValidationError: its options are wrong.
-        TypeError, ValueError: it gives an answer that a trial would refuse.
+        TypeError, ValueError: it gives limits or a state that a trial would refuse.
     """
     updates = trial.updates()
     if not len(updates):
@@ -73,7 +73,7 @@ def replay(trial: TrialReader, method: Choice) -> pd.DataFrame:
 def _checked(
     answer: object, spec: TrialSpec, method: Choice, *, before: CostLimits | None, update: int
 ) -> tuple[CurriculumStep, TeacherState]:
-    """Check a curriculum's answer as a trial does."""
+    """Check the limits and the state of a curriculum's answer as a trial does."""
     num_costs = len(spec.deploy_limits)
     step, state = checked_answer(answer, method.label, num_costs)
     check_limits_fall(

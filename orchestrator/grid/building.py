@@ -26,6 +26,7 @@ from recrl.teachers.teacher import ProgressReport, check_limits_fall, checked_an
 logger = logging.getLogger("recrl.sweep")
 
 PLAIN_AGENT = Choice("ppo-lag")
+CHECKED_STEPS = 16  # of a user's environment
 CHECKED_UPDATES = 200  # at most, of a curriculum of the clock
 NO_CURRICULUM, NO_LIMITS = Choice("none"), Choice("unconstrained")
 
@@ -35,10 +36,10 @@ class BuildError(Exception):
 
 
 def cmdp_of(task: Choice) -> CMDPSpec:
-    """Return the task's CMDP, by building one environment; a user's environment also takes one step.
+    """Return the task's CMDP, by building one environment; a user's environment also takes some steps.
 
     Raises:
-        BuildError: it cannot be built, fails in its first step, or does not begin anew with a reset.
+        BuildError: it cannot be built, fails in its first steps, or does not begin anew with a reset.
     """
     try:
         envs = make_vector(task.name, 1, options=task.options)
@@ -56,7 +57,7 @@ def cmdp_of(task: Choice) -> CMDPSpec:
 
 
 def _try_out(name: str, envs: SyncCMDPVectorEnv) -> None:
-    """Take a step, and repeat it after another reset.
+    """Take some steps, and repeat those of the last episode after another reset.
 
     A wrapper that learns from observations or rewards would give other numbers. Then later episodes are not
     those that a new environment has, with which a trial is resumed and its policy is evaluated.
@@ -64,9 +65,10 @@ def _try_out(name: str, envs: SyncCMDPVectorEnv) -> None:
     try:
         envs.reset(seed=0)
         envs.action_space.seed(0)
-        envs.step(envs.action_space.sample())
+        for _ in range(CHECKED_STEPS):
+            envs.step(envs.action_space.sample())
     except USERS_ERRORS as error:
-        raise BuildError(f"{name} fails in its first step: {described_with_place(error)}") from error
+        raise BuildError(f"{name} fails in its first steps: {described_with_place(error)}") from error
     try:
         envs.load_state_dict(envs.state_dict())
     except USERS_ERRORS as error:

@@ -13,18 +13,17 @@ most new versions change nothing, or only the rounding.
 from __future__ import annotations
 
 import functools
-import os
-import struct
 import sys
 import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
-from importlib.machinery import ModuleSpec, SourceFileLoader
+from importlib.machinery import ModuleSpec
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 from recrl.agents.registry import AGENTS
+from recrl.environments.plugins import is_edited
 from recrl.environments.registry import TASKS
 from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.files.trial_store import TrialStore
@@ -207,7 +206,9 @@ def _digests_of_imported(package: str) -> dict[str, str]:
     """
     digests, place = _digests_of(package), (package, folder_of_files(files_of(package)))
     imported = _imported_of(digests.keys() | {package})
-    before, first = _ran.get(place) or (imported, _without_edited(digests, imported))
+    if place not in _ran:
+        _ran[place] = (imported, _without_edited(digests, imported))
+    before, first = _ran[place]
     are_reloaded = bool(before) and all(imported.get(name) is not spec for name, spec in before.items())
     if digests == first or are_reloaded:
         _ran[place] = (imported, digests)
@@ -217,25 +218,8 @@ def _digests_of_imported(package: str) -> dict[str, str]:
 
 def _without_edited(digests: Mapping[str, str], imported: Mapping[str, ModuleSpec | None]) -> dict[str, str]:
     """Return digests with ``CHANGED`` where a file was edited between its import and the first look at it."""
-    edited = {name.partition(".")[0] for name, spec in imported.items() if spec and _is_edited(spec)}
+    edited = {name.partition(".")[0] for name, spec in imported.items() if spec and is_edited(spec)}
     return {name: CHANGED if name in edited else digest for name, digest in digests.items()}
-
-
-def _is_edited(spec: ModuleSpec) -> bool:
-    """Whether Python's compiled file of an imported module is not of its source as it is now.
-
-    At an import Python writes that file, with time and size of the source in bytes 8 to 16. Where it writes
-    none, the answer is no.
-    """
-    writes = not sys.dont_write_bytecode and type(spec.loader) is SourceFileLoader
-    if not writes or not spec.cached or not spec.origin or not os.access(Path(spec.cached).parent, os.W_OK):
-        return False
-    try:
-        head, source = Path(spec.cached).read_bytes()[:16], os.stat(spec.origin)
-    except OSError:
-        return False
-    mark = struct.pack("<II", int(source.st_mtime) & 0xFFFFFFFF, source.st_size & 0xFFFFFFFF)
-    return head[4:8] == bytes(4) and head[8:] != mark  # with other flags, a digest is in place of both
 
 
 def _imported_of(packages: Collection[str]) -> dict[str, ModuleSpec | None]:

@@ -132,6 +132,8 @@ def existing_cluster(address: str, *, ship_package: bool = False) -> Iterator[No
     named = os.environ.get(ADDRESS_VARIABLE, "")
     if address == "auto" and named not in ("", "auto", "local"):  # Ray would use it without these checks
         address, failure = named, f"cannot use the Ray cluster of {ADDRESS_VARIABLE}, {named}"
+        if "://" in address:
+            raise RecrlError(f"{failure}: it must be host:port of a cluster of this machine; or unset it")
     if "://" in address:  # Ray itself advises against Tune with Ray Client
         raise RecrlError(
             f"{failure}: the driver must run on a node of the cluster, not through Ray Client; "

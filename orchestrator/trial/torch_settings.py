@@ -8,6 +8,19 @@ from contextlib import contextmanager
 import torch
 
 
+def require_float32() -> None:
+    """Check that PyTorch's default type is still that of ``torch_settings``.
+
+    Raises:
+        TypeError: a module that was imported since has changed it.
+    """
+    if (dtype := torch.get_default_dtype()) is not torch.float32:
+        raise TypeError(
+            f"the code of the task, the agent or the curriculum sets PyTorch's default type to {dtype}; "
+            "trials compute in float32, so it must not call torch.set_default_dtype"
+        )
+
+
 @contextmanager
 def torch_settings() -> Iterator[None]:
     """Let PyTorch use one thread and float32, and differentiate, until the end of the block.

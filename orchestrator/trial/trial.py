@@ -43,6 +43,7 @@ from recrl.orchestrator.files.trial_writer import TrialWriter
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.agent_answers import checked_metrics, checked_noise
 from recrl.orchestrator.trial.rollout_check import check_rollout
+from recrl.orchestrator.trial.torch_settings import require_float32
 from recrl.teachers.registry import find_teacher
 from recrl.teachers.teacher import (
     ProgressReport,
@@ -107,6 +108,7 @@ class Trial:
             on_error.callback(self.close)
             self._cmdp = self._environments.cmdp
             self._agent: Agent = make_agent(spec.agent.name, self._cmdp, spec.agent.options, seeds.agent)
+            require_float32()
             self._collector = Collector(self._environments, num_steps=spec.rollout_steps, staggered=True)
             self._start_or_continue(seeds)
             on_error.pop_all()

@@ -798,12 +798,12 @@ def test_a_module_that_is_nowhere_is_a_sentence(folder: Path, capsys: pytest.Cap
     [
         (
             "name: 'room_b:Room'",
-            "grid.yaml:2: tasks.0: room_b:Room fails in its first step: ValueError: room_b:Room: the "
+            "grid.yaml:2: tasks.0: room_b:Room fails in its first steps: ValueError: room_b:Room: the "
             "environment must report info['cost'] at every step: info has no 'cost', only 'speed' (for",
         ),
         (
             "name: gymnasium, options: {id: Pendulum-v1}",
-            "grid.yaml:2: tasks.0: gymnasium fails in its first step: ValueError: gymnasium: the "
+            "grid.yaml:2: tasks.0: gymnasium fails in its first steps: ValueError: gymnasium: the "
             "environment must report info['cost'] at every step: info has no 'cost' (for",
         ),
     ],

@@ -5,6 +5,7 @@ import importlib
 import json
 import sys
 import threading
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -368,12 +369,25 @@ def test_an_edit_between_an_import_and_the_first_trial_is_seen(
         sys.modules.pop(name, None)
     importlib.invalidate_caches()
     module = importlib.import_module("my_scaled_task")
+    (folder / "my_helper.py").write_text("# a comment\n\nREWARD = 1\n")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        before = code_of(spec)
+    assert CHANGED not in before.values()
+    code_changes._ran.clear()
     (folder / "my_helper.py").write_text("REWARD = 1000\n")
     for _ in range(2):
         with pytest.warns(
             UserWarning, match="the code of my_helper has changed since this process imported it"
         ):
             assert code_of(spec) == {**InstalledCode().of(spec), "my_helper": CHANGED}
+        compiled = Path(sys.modules["my_helper"].__spec__.cached)  # type: ignore[union-attr, arg-type]
+        compiled.unlink(missing_ok=True)  # what is known stays known
+    with pytest.warns(
+        UserWarning, match="has changed since this process imported it; the code of before runs"
+    ):
+        (folder / "my_scaled_task.py").write_text(f"import my_helper\nLATER = 1\n{TASK}")
+        import_module("my_scaled_task")
     for name in ("my_helper", "my_scaled_task"):
         importlib.reload(sys.modules[name])
     assert code_of(spec) == InstalledCode().of(spec)

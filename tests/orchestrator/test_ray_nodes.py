@@ -92,7 +92,7 @@ def test_ray_client_is_refused() -> None:
 @pytest.mark.parametrize(
     ("named", "error", "sentence"),
     [
-        ("ray://head:10001", RecrlError, r"of RAY_ADDRESS, ray://head:10001: the driver must run on a node"),
+        ("ray://head:10001", RecrlError, r"of RAY_ADDRESS, ray://head:10001: it must be host:port of a "),
         ("127.0.0.1:1", ClusterError, r"of RAY_ADDRESS, 127\.0\.0\.1:1: .*refused; is it running"),
     ],
 )

@@ -282,7 +282,7 @@ def test_a_task_whose_episodes_depend_on_those_before() -> None:
 
 def test_a_task_that_fails_after_its_first_step() -> None:
     (problem,) = problems(task="own_rehearsed:Broken")
-    assert problem.startswith("grid.yaml:2: tasks.0: own_rehearsed:Broken fails in its first updates: ")
+    assert problem.startswith("grid.yaml:2: tasks.0: own_rehearsed:Broken fails in its first steps: ")
     assert "cost" in problem
 
 

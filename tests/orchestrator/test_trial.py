@@ -210,6 +210,23 @@ def test_a_trial_sets_pytorch_and_leaves_it_the_settings_it_had(
     assert store.episodes_path.read_bytes() == undisturbed.episodes_path.read_bytes()
 
 
+def test_code_that_changes_the_default_type_of_pytorch_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Later trials of the process, which import it no more, would have float32."""
+    (tmp_path / "own_double.py").write_text(
+        "import torch\n"
+        "from recrl.agents.registry import AGENTS\n"
+        "torch.set_default_dtype(torch.float64)\n"
+        "MINE = AGENTS['ppo']\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    store = SweepStore(tmp_path, "sweep").trial(spec := replace(SPEC, agent=Choice("own_double:MINE")))
+    assert run_recorded(spec, store, should_stop=never) is TrialStatus.FAILED
+    assert "sets PyTorch's default type to torch.float64; trials compute in float32" in store.record().error
+    assert torch.get_default_dtype() is torch.float32
+
+
 def test_the_last_part_is_deployment_under_the_deploy_limits(undisturbed: TrialStore) -> None:
     updates = undisturbed.updates()
     assert updates["phase"].tolist() == ["training"] * 19 + ["deployment"]

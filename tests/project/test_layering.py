@@ -223,6 +223,8 @@ MAY_UNPICKLE = {
     # Tune hands the error of a trial to a callback only as a file that this process wrote a moment before, in
     # a private folder. Ray's Trial.get_pickled_error reads the storage, where the file is not yet.
     "orchestrator.ray.tune_callbacks": {"cloudpickle"},
+    # Python's own bytecode of a module that this process has imported from it; it is compared, not run.
+    "environments.plugins": {"marshal"},
 }
 
 
