@@ -182,8 +182,9 @@ def test_numbers_of_numpy_are_plain_numbers(folder: Path) -> None:
 
 
 def test_a_trial_that_fails_raises_with_its_traceback(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    later = '"cost": float(next(COUNT) < 40 or 1 / 0)'  # not yet in the steps of the check
     (folder / "broken_room.py").write_text(
-        OWN_TASK.replace('"cost": 1.0', '"cost": 1.0 / max(0, 3 - self.steps)')
+        "import itertools\nCOUNT = itertools.count()\n" + OWN_TASK.replace('"cost": 1.0', later)
     )
     monkeypatch.setattr(sys, "path", list(sys.path))
     with pytest.raises(recrl.RecrlError, match="ZeroDivisionError") as error:
