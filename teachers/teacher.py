@@ -92,42 +92,90 @@ class Teacher(Protocol):
         ...
 
 
-def checked_answer(answer: object, curriculum: str, num_costs: int) -> tuple[CurriculumStep, TeacherState]:
-    """Check and return the result of a curriculum.
+@dataclass(frozen=True)
+class AnswerCheck:
+    """Check of what a curriculum, possibly of a user's code, returns.
 
-    Args:
-        answer: result of ``Teacher.start`` or ``Teacher.step``, possibly of a user's code.
-        curriculum: its label, for the error.
-        num_costs: k.
-
-    Raises:
-        TypeError: it is not a pair of a CurriculumStep and a mapping, or the mapping has other values than
-            JSON.
-        ValueError: the number of its limits, or start limits, is not that of the costs.
+    Attributes:
+        curriculum: its label, for errors.
+        cost_names: of the task, [k].
+        train_limits: d_t, [k].
+        deploy_limits: d_d, [k].
     """
-    match answer:
-        case (CurriculumStep() as step, Mapping() as state):
-            if len(step.limits) != num_costs:
+
+    curriculum: str
+    cost_names: Sequence[str]
+    train_limits: CostLimits
+    deploy_limits: CostLimits
+
+    def checked(
+        self, answer: object, *, before: CostLimits | None = None, update: int = 0
+    ) -> tuple[CurriculumStep, TeacherState]:
+        """Check and return the result of ``Teacher.start`` or ``Teacher.step``.
+
+        No limit may have risen, and each must be at least d_d, and at most d_t if finite. An infinite limit
+        may start above a finite d_t: it constrains nothing, as in the control ``unconstrained``. Differences
+        by rounding are allowed.
+
+        Args:
+            answer: the result.
+            before: the limits before it, [k]; None at the start.
+            update: the last policy update before it; 0 at the start.
+
+        Raises:
+            TypeError: it is not a pair of a CurriculumStep and a mapping, or the mapping has other values
+                than JSON.
+            ValueError: the number of its limits, or start limits, is not that of the costs; or a limit has
+                risen, or is above d_t or below d_d.
+        """
+        match answer:
+            case (CurriculumStep() as step, Mapping() as state):
+                self._check_limits(step, before, f"after update {update}" if update else "at the start")
+                if problem := _not_json(dict(state), "state"):
+                    raise TypeError(
+                        f"curriculum {self.curriculum}: {problem}; a state holds JSON values only"
+                    )
+                return step, state
+        got = (
+            ", ".join(type(one).__name__ for one in answer)
+            if isinstance(answer, tuple)
+            else type(answer).__name__
+        )
+        raise TypeError(
+            f"curriculum {self.curriculum}: must return a CurriculumStep and its state, a mapping, got {got}"
+        )
+
+    def _check_limits(self, step: CurriculumStep, before: CostLimits | None, when: str) -> None:
+        of_whom, num_costs = f"curriculum {self.curriculum}", len(self.cost_names)
+        if len(step.limits) != num_costs:
+            raise ValueError(
+                f"{of_whom}: a step must have one limit per cost, {num_costs}, got {len(step.limits)}"
+            )
+        if step.start_limits is not None and len(step.start_limits) != num_costs:
+            raise ValueError(
+                f"{of_whom}: start_limits must be None or one limit per cost, {num_costs}, "
+                f"got {len(step.start_limits)}"
+            )
+        for i, (name, limit) in enumerate(zip(self.cost_names, step.limits, strict=True)):
+            if before is not None and _exceeds(limit, before[i]):
                 raise ValueError(
-                    f"curriculum {curriculum}: a step must have one limit per cost, {num_costs}, "
-                    f"got {len(step.limits)}"
+                    f"{of_whom}: the limit of {name} rose from {before[i]:g} to {limit:g} {when}; "
+                    "limits may only fall"
                 )
-            if step.start_limits is not None and len(step.start_limits) != num_costs:
+            if math.isfinite(limit) and _exceeds(limit, self.train_limits[i]):
                 raise ValueError(
-                    f"curriculum {curriculum}: start_limits must be None or one limit per cost, {num_costs}, "
-                    f"got {len(step.start_limits)}"
+                    f"{of_whom}: the limit of {name} is {limit:g} {when}, above its train_limits "
+                    f"of {self.train_limits[i]:g}; limits may only fall"
                 )
-            if problem := _not_json(dict(state), "state"):
-                raise TypeError(f"curriculum {curriculum}: {problem}; a state holds JSON values only")
-            return step, state
-    got = (
-        ", ".join(type(one).__name__ for one in answer)
-        if isinstance(answer, tuple)
-        else type(answer).__name__
-    )
-    raise TypeError(
-        f"curriculum {curriculum}: must return a CurriculumStep and its state, a mapping, got {got}"
-    )
+            if _exceeds(self.deploy_limits[i], limit):
+                raise ValueError(
+                    f"{of_whom}: the limit of {name} is {limit:g} {when}, below its deploy_limits "
+                    f"of {self.deploy_limits[i]:g}; limits may only fall to that"
+                )
+
+
+def _exceeds(limit: float, other: float) -> bool:
+    return limit > other and not math.isclose(limit, other, rel_tol=1e-9, abs_tol=1e-9)
 
 
 def _not_json(value: object, path: str) -> str:
@@ -156,56 +204,6 @@ def _not_json(value: object, path: str) -> str:
 def _with_article(value: object) -> str:
     kind = type(value).__name__
     return f"an {kind}" if kind[0].lower() in "aeiou" or kind == "ndarray" else f"a {kind}"
-
-
-def check_limits_fall(
-    step: CurriculumStep,
-    before: CostLimits | None,
-    train_limits: CostLimits,
-    *,
-    deploy_limits: CostLimits,
-    curriculum: str,
-    cost_names: Sequence[str],
-    update: int,
-) -> None:
-    """Check that no limit of a step has risen, and that each is at least d_d, and at most d_t if finite.
-
-    An infinite limit may start above a finite d_t: it constrains nothing, as in the control
-    ``unconstrained``. Differences by rounding are allowed.
-
-    Args:
-        step: the step to be checked.
-        before: the limits before it, [k]; None for the first step.
-        train_limits: d_t, [k].
-        deploy_limits: d_d, [k].
-        curriculum: its label, for the error.
-        cost_names: of the task, [k].
-        update: the last policy update before the step; 0 for the first step.
-
-    Raises:
-        ValueError: a limit has risen, or is above d_t or below d_d.
-    """
-    when = f"after update {update}" if update else "at the start"
-    for i, (name, limit, highest) in enumerate(zip(cost_names, step.limits, train_limits, strict=True)):
-        if before is not None and _exceeds(limit, before[i]):
-            raise ValueError(
-                f"curriculum {curriculum}: the limit of {name} rose from {before[i]:g} to {limit:g} {when}; "
-                "limits may only fall"
-            )
-        if math.isfinite(limit) and _exceeds(limit, highest):
-            raise ValueError(
-                f"curriculum {curriculum}: the limit of {name} is {limit:g} {when}, above its train_limits "
-                f"of {highest:g}; limits may only fall"
-            )
-        if _exceeds(deploy_limits[i], limit):
-            raise ValueError(
-                f"curriculum {curriculum}: the limit of {name} is {limit:g} {when}, below its deploy_limits "
-                f"of {deploy_limits[i]:g}; limits may only fall to that"
-            )
-
-
-def _exceeds(limit: float, other: float) -> bool:
-    return limit > other and not math.isclose(limit, other, rel_tol=1e-9, abs_tol=1e-9)
 
 
 # The rest is common to the teachers of this package. Their states hold at least ``update``, the last update

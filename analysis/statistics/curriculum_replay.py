@@ -20,15 +20,9 @@ import pandas as pd
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.trial_reader import TrialReader
-from recrl.orchestrator.spec import Choice, TrialSpec
+from recrl.orchestrator.spec import Choice
 from recrl.teachers.registry import make_teacher
-from recrl.teachers.teacher import (
-    ProgressReport,
-    TeacherSpec,
-    TeacherState,
-    check_limits_fall,
-    checked_answer,
-)
+from recrl.teachers.teacher import AnswerCheck, ProgressReport, TeacherSpec
 
 
 def replay(trial: TrialReader, method: Choice) -> pd.DataFrame:
@@ -54,38 +48,22 @@ def replay(trial: TrialReader, method: Choice) -> pd.DataFrame:
     teacher = make_teacher(
         TeacherSpec(method.name, method.options, spec.train_limits, spec.deploy_limits, spec.train_steps)
     )
-    step, state = _checked(teacher.start(), spec, method, before=None, update=0)
+    costs = range(len(spec.deploy_limits))
+    names = [f"cost {i}" for i in costs]
+    check = AnswerCheck(method.label, names, spec.train_limits, spec.deploy_limits)
+    step, state = check.checked(teacher.start())
     steps = []
     for report in progress_reports(trial, updates):
         steps.append(step)
         if report.env_steps < spec.train_steps:
             answer = teacher.step(state, report)
-            step, state = _checked(answer, spec, method, before=step.limits, update=report.update)
+            step, state = check.checked(answer, before=step.limits, update=report.update)
         else:
             step = CurriculumStep(spec.deploy_limits)
-    costs = range(len(spec.deploy_limits))
     recorded = (f"{name}_{i}" for name in ("cost", "limit") for i in costs)
     columns = ["update", "phase", "end_step", *recorded, "noise"]
     limits = {f"replayed_limit_{i}": [each.limits[i] for each in steps] for i in costs}
     return updates[columns].assign(**limits, replayed_noise=[each.policy_noise for each in steps])
-
-
-def _checked(
-    answer: object, spec: TrialSpec, method: Choice, *, before: CostLimits | None, update: int
-) -> tuple[CurriculumStep, TeacherState]:
-    """Check the limits and the state of a curriculum's answer as a trial does."""
-    num_costs = len(spec.deploy_limits)
-    step, state = checked_answer(answer, method.label, num_costs)
-    check_limits_fall(
-        step,
-        before,
-        spec.train_limits,
-        deploy_limits=spec.deploy_limits,
-        curriculum=method.label,
-        cost_names=[f"cost {i}" for i in range(num_costs)],
-        update=update,
-    )
-    return step, state
 
 
 def progress_reports(trial: TrialReader, updates: pd.DataFrame) -> Iterator[ProgressReport]:

@@ -21,7 +21,7 @@ from recrl.orchestrator.located_yaml import Place
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.teachers.registry import TEACHERS, find_teacher, make_teacher
 from recrl.teachers.static import StaticTeacher
-from recrl.teachers.teacher import ProgressReport, check_limits_fall, checked_answer
+from recrl.teachers.teacher import AnswerCheck, ProgressReport
 
 logger = logging.getLogger("recrl.sweep")
 
@@ -178,17 +178,8 @@ def _mistake(spec: TrialSpec) -> str:
 
 def _check_start(spec: TrialSpec, cmdp: CMDPSpec) -> None:
     """Check the first step of a trial's curriculum, and its state."""
-    label = spec.method.label
-    step, _ = checked_answer(make_teacher(spec.teacher).start(), label, cmdp.num_costs)
-    check_limits_fall(
-        step,
-        None,
-        spec.train_limits,
-        deploy_limits=spec.deploy_limits,
-        curriculum=label,
-        cost_names=cmdp.cost_names,
-        update=0,
-    )
+    check = AnswerCheck(spec.method.label, cmdp.cost_names, spec.train_limits, spec.deploy_limits)
+    check.checked(make_teacher(spec.teacher).start())
 
 
 def _check_decay(spec: TrialSpec, cmdp: CMDPSpec) -> None:
@@ -201,21 +192,13 @@ def _check_decay(spec: TrialSpec, cmdp: CMDPSpec) -> None:
     teacher = make_teacher(replace(spec.teacher, train_limits=train_limits))
     if not isinstance(teacher, StaticTeacher):
         return
+    check = AnswerCheck(spec.method.label, cmdp.cost_names, train_limits, spec.deploy_limits)
     step, state = teacher.start()
     updates = -(-spec.train_steps // spec.steps_per_update)
     chosen = np.linspace(1, updates, min(updates, CHECKED_UPDATES), dtype=int).tolist()
     for number, update in enumerate(chosen, 1):  # reports have consecutive numbers
-        before = step.limits
-        step, state = teacher.step(state, ProgressReport(number, update * spec.steps_per_update, ()))
-        check_limits_fall(
-            step,
-            before,
-            train_limits,
-            deploy_limits=spec.deploy_limits,
-            curriculum=spec.method.label,
-            cost_names=cmdp.cost_names,
-            update=update,
-        )
+        answer = teacher.step(state, ProgressReport(number, update * spec.steps_per_update, ()))
+        step, state = check.checked(answer, before=step.limits, update=update)
 
 
 def _is_own_task(task: Choice) -> bool:

@@ -45,13 +45,7 @@ from recrl.orchestrator.trial.agent_answers import checked_metrics, checked_nois
 from recrl.orchestrator.trial.rollout_check import check_rollout
 from recrl.orchestrator.trial.torch_settings import require_float32
 from recrl.teachers.registry import find_teacher
-from recrl.teachers.teacher import (
-    ProgressReport,
-    Teacher,
-    TeacherState,
-    check_limits_fall,
-    checked_answer,
-)
+from recrl.teachers.teacher import AnswerCheck, ProgressReport, Teacher, TeacherState
 
 LOGGED_UPDATES = 50
 """Approximate number of log lines of a trial."""
@@ -254,7 +248,8 @@ class Trial:
     def _checked(self, answer: object, *, before: CostLimits | None) -> tuple[CurriculumStep, TeacherState]:
         """Check the curriculum's answer; ``before`` has the limits before it, None at the start."""
         label = self.spec.method.label
-        step, state = checked_answer(answer, label, self._cmdp.num_costs)
+        check = AnswerCheck(label, self._cmdp.cost_names, self.spec.train_limits, self.spec.deploy_limits)
+        step, state = check.checked(answer, before=before, update=self.update)
         if step.entropy_coefficient is not None and not self._curriculum.rewards_entropy:
             raise TypeError(
                 f"curriculum {label}: a step has an entropy_coefficient, so its TeacherKind must have "
@@ -265,15 +260,6 @@ class Trial:
                 f"method {self.spec.method.name} rewards entropy, which agent {self.spec.agent.name} does "
                 "not support; choose another of the two"
             )
-        check_limits_fall(
-            step,
-            before,
-            self.spec.train_limits,
-            curriculum=label,
-            deploy_limits=self.spec.deploy_limits,
-            cost_names=self._cmdp.cost_names,
-            update=self.update,
-        )
         return step, state
 
     def _entropy_coefficient(self, step: CurriculumStep) -> dict[str, float]:

@@ -15,13 +15,7 @@ from hypothesis import strategies as st
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
 from recrl.teachers.registry import TEACHERS, make_teacher
-from recrl.teachers.teacher import (
-    ProgressReport,
-    TeacherSpec,
-    TeacherState,
-    check_limits_fall,
-    checked_answer,
-)
+from recrl.teachers.teacher import AnswerCheck, ProgressReport, TeacherSpec, TeacherState
 
 # Every teacher under its defaults, and the dynamic one also where its settings lead elsewhere.
 VARIANTS: list[tuple[str, dict[str, Any]]] = [
@@ -128,18 +122,10 @@ def test_limits_never_rise(history: History) -> None:
 def test_every_answer_passes_the_trials_checks(history: History) -> None:
     names = ["a", "b", "c"][: len(history.train_limits)]
     for spec in history.specs():
+        check = AnswerCheck(spec.name, names, spec.train_limits, spec.deploy_limits)
         before = None
         for update, answer in enumerate(played(spec, history.reports)):
-            step, _ = checked_answer(answer, spec.name, len(names))
-            check_limits_fall(
-                step,
-                before,
-                spec.train_limits,
-                deploy_limits=spec.deploy_limits,
-                curriculum=spec.name,
-                cost_names=names,
-                update=update,
-            )
+            step, _ = check.checked(answer, before=before, update=update)
             before = step.limits
 
 
@@ -297,6 +283,7 @@ def test_a_cost_that_is_never_constrained_stays_so(name: str, options: dict[str,
 
 
 STATE: dict[str, Any] = {"update": 0}
+ONE_COST = AnswerCheck("mine", ("cost",), CostLimits((9.0,)), CostLimits((1.0,)))
 
 
 @pytest.mark.parametrize(
@@ -314,7 +301,7 @@ STATE: dict[str, Any] = {"update": 0}
 )
 def test_what_is_wrong_with_a_curriculums_answer_is_said(answer: object, sentence: str) -> None:
     with pytest.raises((TypeError, ValueError), match=sentence):
-        checked_answer(answer, "mine", 1)
+        ONE_COST.checked(answer)
 
 
 @pytest.mark.parametrize(
@@ -330,13 +317,13 @@ def test_what_is_wrong_with_a_curriculums_answer_is_said(answer: object, sentenc
 )
 def test_a_state_that_is_no_json_is_said_with_its_path(state: dict[str, Any], problem: str) -> None:
     with pytest.raises(TypeError) as caught:
-        checked_answer((CurriculumStep(CostLimits((1.0,))), state), "set", 1)
-    assert str(caught.value) == f"curriculum set: {problem}; a state holds JSON values only"
+        ONE_COST.checked((CurriculumStep(CostLimits((1.0,))), state))
+    assert str(caught.value) == f"curriculum mine: {problem}; a state holds JSON values only"
 
 
 def test_a_state_of_json_values_is_right() -> None:
     state = {"update": 3, "costs": [[1.0, math.inf]], "best": None, "of": {"a": True}, "said": "yes"}
-    assert checked_answer((CurriculumStep(CostLimits((1.0,))), state), "mine", 1)[1] is state
+    assert ONE_COST.checked((CurriculumStep(CostLimits((1.0,))), state))[1] is state
 
 
 def test_plain_numbers_are_limits_too() -> None:
@@ -344,7 +331,8 @@ def test_plain_numbers_are_limits_too() -> None:
     assert step.limits == CostLimits((2.0, 1.0))
     assert step.start_limits == CostLimits((5.0, math.inf))
     assert CurriculumStep.from_json(step.to_json()) == step
-    assert checked_answer((step, STATE), "mine", 2) == (step, STATE)
+    check = AnswerCheck("mine", ("fuel", "noise"), CostLimits((5.0, math.inf)), CostLimits((1.0, 1.0)))
+    assert check.checked((step, STATE)) == (step, STATE)
 
 
 INF = math.inf
@@ -385,20 +373,12 @@ INF = math.inf
 def test_a_limit_that_rises_is_an_error_with_its_cost(
     before: float | None, limit: float, train: float, sentence: str | None
 ) -> None:
-    def check() -> None:
-        check_limits_fall(
-            CurriculumStep(CostLimits((1.0, limit))),
-            None if before is None else CostLimits((1.0, before)),
-            CostLimits((1.0, train)),
-            deploy_limits=CostLimits((1.0, 1.0)),
-            curriculum="rising",
-            cost_names=("fuel", "noise"),
-            update=0 if before is None else 5,
-        )
-
+    check = AnswerCheck("rising", ("fuel", "noise"), CostLimits((1.0, train)), CostLimits((1.0, 1.0)))
+    answer = CurriculumStep(CostLimits((1.0, limit))), STATE
+    limits, update = (None, 0) if before is None else (CostLimits((1.0, before)), 5)
     if sentence is None:
-        check()
+        assert check.checked(answer, before=limits, update=update) == answer
         return
     with pytest.raises(ValueError) as caught:
-        check()
+        check.checked(answer, before=limits, update=update)
     assert str(caught.value) == f"curriculum rising: {sentence}"
