@@ -6,7 +6,8 @@
 The tables are those of ``final_policies.py``; one task of the first has a rule. Printed are the
 conditions of the rule, for ppo-lag's final stochastic policies. Then come the differences of linear from
 none in return and cost, with 95% intervals, paired (Student) and as two groups (Welch): of these seeds, of
-these with the first earlier table if there is one, and of all.
+these with the first earlier table if there is one, and of all. A table whose seeds suggested the question
+comes last.
 """
 
 from __future__ import annotations

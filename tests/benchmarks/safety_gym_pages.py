@@ -28,7 +28,10 @@ FRESH = "table.csv"
 FRESH_PHASE = "table-deployment-phase.csv"
 MULTIPLIERS = "multipliers.csv"  # of ppo-lag, in the first and the last update of the deployment phase
 CLAIMS = "table-claims.csv"
-CONFIRMATIONS = ("button-confirm", "goal-confirm")
+CONFIRMATIONS = {  # with earlier rows; the last ones suggested the question
+    "button-confirm": (PILOT[0], FRESH),
+    "goal-confirm": (FRESH, PILOT[0]),
+}
 CONTROLS = ("controls", "early-landing", "short-training")  # with rows of the deployment phase, as the table
 AGENTS = ("ppo-lag", "cpo")
 TASKS = ("CarGoal2", "CarButton2", "CarPush2")
@@ -127,8 +130,11 @@ def shown(row: pd.Series[Any]) -> str:
 
 
 def differences_of(rows: pd.DataFrame) -> dict[Key, str]:
-    """Return the differences in return from ``none`` of each agent, task and curriculum."""
-    table = paired_differences(rows, "none", "return")
+    """Return the differences in return from ``none`` of each agent, task and curriculum.
+
+    They are those of two groups, because equal seeds of different machines are no pairs.
+    """
+    table = paired_differences(rows, "none", "return", as_groups=True)
     return {(row["agent"], row["task"], row["method"]): shown(row) for _, row in table.iterrows()}
 
 

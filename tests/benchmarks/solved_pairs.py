@@ -55,13 +55,31 @@ def lines(rows: pd.DataFrame, first: str, second: str) -> Iterator[str]:
     )
     yield f"pairs that only one solves, of {len(pairs)}:"
     yield only.groupby(["task", "agent"]).sum().to_string()
-    one, other = only.sum()
-    p = binomtest(one, one + other).pvalue if one + other else 1.0
-    yield f"together: {first} {one}, {second} {other}, exact p {p:.4f}"
+    yield f"together: {mcnemar(first, second, *only.sum())}"
+
+
+def mcnemar(first: str, second: str, only_first: int, only_second: int) -> str:
+    """Return how many only one of two solves, and the exact p value."""
+    both = only_first + only_second
+    p = float(binomtest(only_first, both).pvalue) if both else 1.0
+    return f"{first} {only_first}, {second} {only_second}, exact p {p:.4f}"
+
+
+def kinds_of_policy(rows: pd.DataFrame) -> Iterator[str]:
+    """Yield how many trials only the average, or only the last policy, solves, a line an agent.
+
+    Args:
+        rows: of ``judged``.
+    """
+    wide = rows.pivot(index=[*PAIR, "method"], columns="policy", values="solved").astype(bool)
+    for agent, trials in wide.groupby("agent"):
+        average, last = trials["average"], trials["last"]
+        counts = int((average & ~last).sum()), int((last & ~average).sum())
+        yield f"{agent}: {mcnemar('average', 'last', *counts)}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the counts of the averaged policies, then those of the last ones."""
+    """Print the counts of the averaged and of the last policies, and of trials in which they differ."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("tables", nargs="+", type=Path, metavar="TABLE")
     parser.add_argument("--compare", nargs=2, default=["dynamic", "none"], metavar="CURRICULUM")
@@ -73,6 +91,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         chosen = rows[rows["policy"] == policy]
         print(f"\n{policy}: {int(chosen['solved'].sum())} of {len(chosen)} solved")
         print("\n".join(lines(chosen, *given.compare)))
+    print(f"\ntrials of which only one policy solves, of {len(rows) // 2}:")
+    print("\n".join(kinds_of_policy(rows)))
 
 
 if __name__ == "__main__":
