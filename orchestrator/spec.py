@@ -183,14 +183,24 @@ class TrialSpec:
         check_json(value, _SPEC_FILE)
         if len(value["train_limits"]) != len(value["deploy_limits"]):
             raise ValueError("train_limits and deploy_limits: must have the same length")
+        train_limits, deploy_limits = (
+            CostLimits.from_json(value[name]) for name in ("train_limits", "deploy_limits")
+        )
+        if not all(map(math.isfinite, deploy_limits)):
+            raise ValueError(f"deploy_limits: must be finite, got {deploy_limits.to_json()}")
+        if any(train < deploy for train, deploy in zip(train_limits, deploy_limits, strict=True)):
+            raise ValueError(
+                f"train_limits: must be at least deploy_limits, {deploy_limits.to_json()}, "
+                f"got {train_limits.to_json()}"
+            )
         return cls(
             **{
                 **value,
                 "task": Choice(**value["task"]),
                 "agent": Choice(**value["agent"]),
                 "method": Choice(**value["method"]),
-                "train_limits": CostLimits.from_json(value["train_limits"]),
-                "deploy_limits": CostLimits.from_json(value["deploy_limits"]),
+                "train_limits": train_limits,
+                "deploy_limits": deploy_limits,
             }
         )
 

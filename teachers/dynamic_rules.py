@@ -53,7 +53,7 @@ def next_limit(limit: float, cost: float, deploy_limit: float, *, remaining: int
     Args:
         limit: d, possibly infinite.
         cost: C-bar, at least 0.
-        deploy_limit: d_d; infinite for a cost that is never constrained.
+        deploy_limit: d_d, finite.
         remaining: n, the number of remaining steps; less than 1 counts as 1.
 
     >>> next_limit(math.inf, 65.0, 5.0, remaining=6)

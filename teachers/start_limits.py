@@ -50,11 +50,7 @@ class StartMeasurement:
 
     def begin(self) -> dict[str, Any]:
         """Return the four keys before any update."""
-        is_open = any(
-            math.isinf(train) and math.isfinite(deploy)
-            for train, deploy in zip(self.spec.train_limits, self.spec.deploy_limits, strict=True)
-        )
-        measure = is_open and self.start_fraction > 0.0
+        measure = self.start_fraction > 0.0 and any(map(math.isinf, self.spec.train_limits))
         return {
             "start_limits": None if measure else self.spec.train_limits.to_json(),
             "start_episodes": 0,

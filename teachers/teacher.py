@@ -45,7 +45,7 @@ class TeacherSpec:
         name: registry name (``none``, ``linear``, ``dynamic``, ...), entry point or import path.
         options: the teacher's settings, which its config class validates.
         train_limits: d_t, [k], possibly infinite.
-        deploy_limits: d_d, [k], each at most d_t; infinite for a cost that is never constrained.
+        deploy_limits: d_d, [k], finite, each at most d_t.
         train_steps: B, environment steps of the training phase, at least 1.
     """
 
@@ -65,6 +65,8 @@ class TeacherSpec:
                 f"got {len(self.train_limits)} and {len(self.deploy_limits)}"
             )
         for train, deploy in zip(self.train_limits, self.deploy_limits, strict=True):
+            if math.isinf(deploy):
+                raise ValueError(f"deploy_limits must be finite, got {self.deploy_limits.to_json()}")
             if train < deploy:
                 raise ValueError(
                     f"train_limits must be at least deploy_limits (d_t >= d_d), got {train} < {deploy}"

@@ -6,11 +6,9 @@ the numbers of the CSV files' columns: cost 0, cost 1.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from itertools import zip_longest
-from typing import Any
 
 from recrl.analysis.data.sweep_data import Sweep, TrialFacts
 from recrl.environments.plugins import nearest
@@ -95,11 +93,8 @@ def _is_named(names: tuple[str, ...]) -> bool:
 
 def _recorded(trial: TrialFacts, num_costs: int) -> tuple[str, ...]:
     """Return the names that the last attempt recorded; empty if there are none of the right form."""
-    try:
-        attempts: list[Any] = json.loads(trial.provenance).get("attempts", [])
-        names = attempts[-1].get("cost_names", ())
-    except (ValueError, AttributeError, IndexError, TypeError, KeyError):
-        return ()
+    attempts = trial.attempts
+    names = attempts[-1].get("cost_names") if attempts else None
     if not isinstance(names, list) or len(names) != num_costs:
         return ()
     texts = tuple(name for name in names if isinstance(name, str) and 0 < len(name) <= LONGEST_NAME)

@@ -34,6 +34,7 @@ Episode files may have 500,000 rows per trial. ``load`` reads them one at a time
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import re
@@ -112,6 +113,16 @@ class TrialFacts:
     cpu_seconds: float = 0.0
     start_limits: Sequence[float | str] | None = None
     provenance: str = ""
+
+    @property
+    def attempts(self) -> list[dict[str, Any]]:
+        """The provenance of each attempt, the first one first; empty if it is unknown or of another form."""
+        try:
+            found = json.loads(self.provenance)
+        except ValueError:
+            return []
+        attempts = found.get("attempts") if isinstance(found, dict) else None
+        return [it for it in attempts if isinstance(it, dict)] if isinstance(attempts, list) else []
 
 
 @dataclass(frozen=True, repr=False)

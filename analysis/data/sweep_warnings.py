@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -177,9 +176,5 @@ def _titles(flags: pd.DataFrame, flag: str) -> list[str]:
 
 
 def attempts(trial: TrialFacts) -> list[dict[str, Any]]:
-    """Return the known provenance of each attempt; empty if no attempt began."""
-    try:
-        attempts = json.loads(trial.provenance).get("attempts", [])
-    except (ValueError, AttributeError):
-        return []
-    return [it for it in attempts if isinstance(it, dict) and isinstance(it.get("code"), dict)]
+    """Return the provenance of the attempts that recorded their code."""
+    return [it for it in trial.attempts if isinstance(it.get("code"), dict)]

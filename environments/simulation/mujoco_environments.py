@@ -21,7 +21,6 @@ from pydantic import BaseModel
 
 from recrl.environments.cmdp import CMDPSpec, Floats, ObservationComponent
 from recrl.environments.saved_state import IDENTITY, SavedState, identity
-from recrl.environments.simulation.actions import give_actions
 from recrl.environments.simulation.camera import Camera, Renderer
 from recrl.environments.simulation.environment_batch import Booleans, EnvironmentBatch, Observations
 from recrl.environments.vector import CMDPVectorEnv, masked_environments
@@ -72,14 +71,29 @@ class Description:
         return {"render_modes": ["rgb_array"], "render_fps": self.frames_per_second}
 
     def act(self, batch: Batch, actions: npt.NDArray[Any], shape: tuple[int, ...]) -> None:
-        """Set the actions of the next step.
+        """Set the actions of the next step, clipped to their bounds as Safety Gym does.
+
+        Args:
+            batch: the environments.
+            actions: one for each environment, or for the only one.
+            shape: required shape of the actions.
 
         Raises:
             ValueError: there was no reset, or the actions are invalid.
         """
         if not batch.generators:
             raise ValueError(f"{self.name}: call reset before the first step")
-        give_actions(self.name, batch, actions, shape=shape, bound=self.action_bound)
+        actions = np.asarray(actions)
+        if actions.shape != shape or actions.dtype.kind not in "fiu":
+            raise ValueError(
+                f"{self.name}: actions must be numbers of shape {shape}, "
+                f"got {actions.dtype} of shape {actions.shape}"
+            )
+        if batch.set_actions(actions):
+            return
+        if not np.isfinite(actions).all():
+            raise ValueError(f"{self.name}: actions must be finite, got {actions.tolist()}")
+        batch.set_actions(np.clip(actions, -self.action_bound, self.action_bound))
 
 
 @dataclass(frozen=True)

@@ -106,7 +106,7 @@ def run_check(request: CheckRequest, console: Console) -> ExitCode:
 def _is_lost(trial: TrialStore) -> bool:
     """Whether the object store has nothing of a trial that can be used, so that its copy must be kept."""
     try:
-        return trial.recorded().status is TrialStatus.DAMAGED
+        return trial.stored_record().status is TrialStatus.DAMAGED
     except StorageError:
         return False
 

@@ -86,14 +86,14 @@ class TrialReader(TrialFiles):
         """Return the record, and what ``check`` finds wrong; again if the record changes meanwhile."""
         recorded = None
         for _ in range(READ_TRIES):
-            recorded, before = self._recorded(), recorded
+            recorded, before = self._stored_record(), recorded
             found = check(recorded)
             if not found or recorded == before:
                 break
         assert recorded is not None
         return recorded, found
 
-    def recorded(self) -> TrialRecord:
+    def stored_record(self) -> TrialRecord:
         """Read ``state.json`` without a check of other files; a blank record if it is missing.
 
         Raises:
@@ -101,11 +101,11 @@ class TrialReader(TrialFiles):
             StorageError: it cannot be read at present.
         """
         try:
-            return self._recorded()
+            return self._stored_record()
         except StorageError as error:
             raise type(error)(f"{self.folder.name}: {error}") from error
 
-    def _recorded(self) -> TrialRecord:
+    def _stored_record(self) -> TrialRecord:
         try:
             value = read_sealed(self.state_path, version=RECORD_FORMAT)
             owner = value.pop("trial_id")
@@ -227,7 +227,7 @@ class TrialReader(TrialFiles):
         """
         recorded: TrialRecord | None = None
         for _ in range(READ_TRIES):
-            recorded, before = self.recorded(), recorded
+            recorded, before = self.stored_record(), recorded
             extent = recorded.extents.get(path.name, Extent())
             data = _head(path, extent.length)
             if Extent.of(data) == extent:
@@ -290,14 +290,19 @@ class TrialReader(TrialFiles):
         return tree
 
     def latest_checkpoint(self) -> dict[str, Any] | None:
-        """Return the newest intact checkpoint, or None; damaged ones are skipped.
+        """Return the content of ``newest_intact``."""
+        found = self.newest_intact()
+        return found[1] if found else None
+
+    def newest_intact(self) -> tuple[Path, dict[str, Any]] | None:
+        """Return path and content of the newest intact checkpoint, or None; damaged ones are skipped.
 
         Raises:
             StorageError: a checkpoint cannot be read at present.
         """
         for path in self.checkpoints():
             try:
-                return self.load_checkpoint(path)
+                return path, self.load_checkpoint(path)
             except CheckpointError:
                 continue
         return None

@@ -125,7 +125,7 @@ class TrialStore(TrialReader):
         """
         rows = files_of(FileKind.ROWS)
         try:
-            old = self._recorded()
+            old = self._stored_record()
         except DamagedError as error:
             logger.warning("%s: %s; it is moved aside", self.folder.name, error)
             for path in (self.state_path, self.spec_path, self.evaluation_path, self.policy_path):
@@ -240,7 +240,7 @@ class TrialStore(TrialReader):
         with self.locked():
             self._set_all_aside_on_request()
             try:
-                recorded = self._recorded()
+                recorded = self._stored_record()
             except DamagedError:
                 self.move_aside(self.state_path)
                 recorded = TrialRecord(attempt=self._attempts_made())

@@ -31,6 +31,7 @@ from recrl.orchestrator.spec import TrialSpec, TrialStatus
 if TYPE_CHECKING:
     from recrl.orchestrator.files.trial_store import TrialStore
 
+COMMIT_SECONDS = 20.0  # between two commits
 KEPT_CHECKPOINTS = 2
 PROVENANCE_FORMAT = 2
 
@@ -248,7 +249,7 @@ class TrialWriter:
     @contextmanager
     def _lease(self) -> Iterator[None]:
         with self.store.writing(), self.store.locked():
-            if self.store.recorded().token != self.record.token:
+            if self.store.stored_record().token != self.record.token:
                 raise LostLeaseError(f"{self.store.folder.name}: another attempt runs this trial now")
             yield
 

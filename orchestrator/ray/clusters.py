@@ -74,7 +74,7 @@ logger = logging.getLogger("recrl.sweep")
 
 
 @contextmanager
-def local_cluster(num_cpus: int | None = None) -> Iterator[Path]:
+def local_cluster(num_cpus: int) -> Iterator[Path]:
     """Start a Ray cluster on this machine until the end of the context, closed to other users.
 
     Its services listen at the loopback address and require a token, so that neither other machines nor other
@@ -82,7 +82,7 @@ def local_cluster(num_cpus: int | None = None) -> Iterator[Path]:
     this user can read, with the token.
 
     Args:
-        num_cpus: number of cores, at least 1; all of the machine's if None.
+        num_cpus: number of cores, at least 1.
 
     Yields:
         The cluster's folder.

@@ -39,6 +39,7 @@ from ray.tune.search import BasicVariantGenerator
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.stop_file import StopSignal
+from recrl.orchestrator.files.trial_writer import COMMIT_SECONDS
 from recrl.orchestrator.grid.file_models import Resources
 from recrl.orchestrator.launch_plan import usable_cores
 from recrl.orchestrator.ray.clusters import QUIET, WORKER, existing_cluster, local_cluster
@@ -60,7 +61,6 @@ class RayExecutor:
     """``Executor`` that runs trials in parallel on Ray.
 
     Attributes:
-        num_cpus: cores of the cluster that is started on this machine; all that this process may use if None.
         address: an existing cluster (``auto``, ``host:port``) to use instead.
         ship_package: whether to send recrl itself to that cluster's nodes.
         resources: of the grid. Without a ``max_concurrent`` as many trials run as fit at the start.
@@ -68,12 +68,11 @@ class RayExecutor:
         commit_seconds: wall seconds between a trial's checkpoints, above 0.
     """
 
-    num_cpus: int | None = None
     address: str | None = None
     ship_package: bool = False
     resources: Resources = field(default_factory=Resources)
     max_failures: int = 3
-    commit_seconds: float = 20.0
+    commit_seconds: float = COMMIT_SECONDS
 
     def run(self, specs: Sequence[TrialSpec], place: SweepPlace, stop: threading.Event) -> None:
         """See ``Executor.run``. Uses the Ray cluster that this process is connected to, if any.
@@ -110,7 +109,7 @@ class RayExecutor:
             return nullcontext()
         if self.address:
             return existing_cluster(self.address, ship_package=self.ship_package)
-        return local_cluster(self.num_cpus or usable_cores())
+        return local_cluster(usable_cores())
 
     def _run_on_cluster(
         self,

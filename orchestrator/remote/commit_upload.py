@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from recrl.orchestrator.background_thread import background_thread
-from recrl.orchestrator.errors import CheckpointError, LostLeaseError, StorageError
+from recrl.orchestrator.errors import LostLeaseError, StorageError
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.trial_files import FileKind, files_of
@@ -54,7 +54,7 @@ class Upload:
         """
         self._remote = remote
         self._trial = trial
-        self._before = trial.recorded().token
+        self._before = trial.stored_record().token
         self._started_from = pulled_key(trial)
         self._commits: list[tuple[str, Commit]] = []
         self._written: set[str] = set()
@@ -88,7 +88,7 @@ class Upload:
 
     def _own_record(self) -> TrialRecord | None:
         """Return the record of the attempt to upload; None before it has begun."""
-        record = self._trial.recorded()
+        record = self._trial.stored_record()
         return None if record.token in ("", self._before) else record
 
     def push(self) -> None:
@@ -137,7 +137,7 @@ class Upload:
         older.
         """
         with self._trial.locked():
-            record = self._trial.recorded()
+            record = self._trial.stored_record()
             saved, rows = _newest_checkpoint(self._trial)
             extents = {**record.extents, **dict.fromkeys(files_of(FileKind.ROWS), Extent()), **rows}
             committed = {name: extent.length for name, extent in extents.items()}
@@ -281,14 +281,12 @@ def _commit_of(record: TrialRecord) -> tuple[Any, ...]:
 
 def _newest_checkpoint(trial: TrialStore) -> tuple[list[str], dict[str, Extent]]:
     """Return the newest intact checkpoint, as a path in the trial's folder, if any, and its rows' extents."""
-    for path in trial.checkpoints():
-        try:
-            tree = trial.load_checkpoint(path)
-            rows = {name: Extent(length, tree["digests"][name]) for name, length in tree["files"].items()}
-            return [f"checkpoints/{path.name}"], rows
-        except CheckpointError:
-            continue
-    return [], {}
+    found = trial.newest_intact()
+    if found is None:
+        return [], {}
+    path, tree = found
+    rows = {name: Extent(length, tree["digests"][name]) for name, length in tree["files"].items()}
+    return [f"checkpoints/{path.name}"], rows
 
 
 def _json(value: Mapping[str, Any]) -> bytes:

@@ -29,7 +29,6 @@ class SweepRuns:
         client: MLflow's.
         experiment_id: the experiment of all sweeps of this name.
         parent_id: the sweep's own run.
-        parent_is_new: whether this run was just made.
         without_params: runs that still need their params.
     """
 
@@ -55,7 +54,6 @@ class SweepRuns:
                 self.delete(run_id)
             self._of_trials = {}
         found = self._of_trials.pop("", None)
-        self.parent_is_new = found is None
         self.parent_id = found or self._create_parent()
         if found is None:  # a user may have deleted the parent only
             for run_id in self._of_trials.values():

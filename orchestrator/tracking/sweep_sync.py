@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
-from collections.abc import Mapping
 from dataclasses import replace
 
 from recrl.orchestrator.files.outcomes_file import OUTCOMES_FILE
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.files.trial_record import TrialRecord
-from recrl.orchestrator.sweep_progress import DisplayStatus, display_status, shown_record
+from recrl.orchestrator.sweep_progress import SweepProgress, progress
 from recrl.orchestrator.tracking.chart_view import charts_page
 from recrl.orchestrator.tracking.export_file import ExportUpload, ExportWriter
 from recrl.orchestrator.tracking.mlflow_runs import SweepRuns
@@ -51,30 +48,26 @@ class SweepSync:
         Returns:
             The reason why the export file could not be uploaded, or empty.
         """
-        trials = map(self._store.trial, self._store.specs())
-        records = {trial.folder.name: shown_record(trial) for trial in trials}
-        position = self._show_state(self._position, records, live=live)
+        now = progress(self._store.specs(), self._store)
+        position = self._show_state(self._position, now, live=live)
         position = self._runs.send_files(position, [self._store.grid_path, self._store.info_path])
         figures = sorted(self._store.figures_folder.glob("[!.]*"))  # no temporary files
         position = self._runs.send_files(position, figures, "figures")
         self._save(position)
         if self._export is None:
             return ""
+        records = {trial.spec.folder_name: trial.record for trial in now.trials}
         position, remark = self._export.bring_up_to_date(position, records, live=live)
         self._save(position)
         return remark
 
-    def _show_state(self, position: Position, records: Mapping[str, TrialRecord], *, live: bool) -> Position:
+    def _show_state(self, position: Position, now: SweepProgress, *, live: bool) -> Position:
         from mlflow.entities import RunTag  # noqa: PLC0415
 
-        now, silence = time.time(), self._store.silence_seconds
-        counts = Counter(
-            display_status(record, now=now, silence_seconds=silence) for record in records.values()
-        )
-        status = sweep_run_status(counts, live=live)
+        status = sweep_run_status(now.counts, live=live)
         text = note(
             self._store.name,
-            {status: counts[status] for status in DisplayStatus},
+            {str(status): count for status, count in now.counts.items()},
             charts=f"#{charts_page(self._runs.experiment_id)}",
             report=f"#{report_page(self._runs.experiment_id, self._runs.parent_id)}",
             report_text=self._report_text(),
@@ -83,7 +76,7 @@ class SweepSync:
             tags = [RunTag("mlflow.note.content", text)]
             self._runs.client.log_batch(position.run_id, tags=tags, synchronous=True)
         if position.shown.get("status") != status:
-            last = max((record.heartbeat for record in records.values()), default=0.0)
+            last = max((trial.record.heartbeat for trial in now.trials), default=0.0)
             self._runs.set_status(position.run_id, status, last or time.time())
         return replace(position, shown={**position.shown, "note": text, "status": status})
 

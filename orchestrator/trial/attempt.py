@@ -20,7 +20,7 @@ from recrl.orchestrator.errors import (
     described,
 )
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.files.trial_writer import TrialWriter
+from recrl.orchestrator.files.trial_writer import COMMIT_SECONDS, TrialWriter
 from recrl.orchestrator.provenance.code_changes import code_of
 from recrl.orchestrator.provenance.versions import collect as collect_provenance
 from recrl.orchestrator.redaction import shown
@@ -32,7 +32,6 @@ from recrl.orchestrator.trial.trial import Trial, open_environments
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import Teacher
 
-COMMIT_SECONDS = 20.0  # between two commits
 HEARTBEAT_SECONDS = 2.0
 
 logger = logging.getLogger("recrl.trial")

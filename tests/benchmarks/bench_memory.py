@@ -129,7 +129,7 @@ def bench(spec: TrialSpec, root: Path) -> None:
     store = SweepStore(root, "memory")
     sync = start_sync(store, tracking_uri(store, None), interval_seconds=5.0)
     with local_cluster(num_cpus=1), MemoryWatch() as watch:
-        RayExecutor(num_cpus=1).run([spec], SweepPlace(store), threading.Event())
+        RayExecutor().run([spec], SweepPlace(store), threading.Event())
     synced = sync.stop(timeout=600.0)
     record = store.trial(spec).record()
     episodes = len(store.trial(spec).episodes())

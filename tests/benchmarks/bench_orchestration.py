@@ -107,7 +107,8 @@ def bench_sweep(*, cores: int, trials: int, updates: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         store = SweepStore(Path(folder), "bench")
         started = time.time()
-        RayExecutor(num_cpus=cores).run(specs, SweepPlace(store), threading.Event())
+        with local_cluster(num_cpus=cores):
+            RayExecutor().run(specs, SweepPlace(store), threading.Event())
         ended = time.time()
         records = [store.trial(spec).record() for spec in specs]
     wall = ended - started

@@ -86,7 +86,7 @@ def watch_trials(specs: Sequence[TrialSpec], root: Path, title: str, seconds: fl
         stop.set()
 
     with background_thread(watch, name="watch"):
-        RayExecutor(num_cpus=len(specs)).run(specs, SweepPlace(store), stop)
+        RayExecutor().run(specs, SweepPlace(store), stop)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -9,7 +9,7 @@ from recrl.orchestrator.files.trial_store import TrialStore
 def commit_file(trial: TrialStore, name: str, text: str) -> None:
     """Write a file of a trial, with its length and digest in the record."""
     (trial.folder / name).write_text(text)
-    record, extent = trial.recorded(), Extent.of(text.encode())
+    record, extent = trial.stored_record(), Extent.of(text.encode())
     trial.write_record(
         replace(
             record,

@@ -243,6 +243,11 @@ def test_a_name_from_a_file_leads_nowhere_else(tmp_path: Path, name: str, foreig
         ({"seed": "0"}, "seed: must be a whole number, got '0'"),
         ({"train_limits": ["nan"]}, "train_limits: must be numbers of at least 0, or 'inf', got 'nan'"),
         ({"train_limits": [3.0, 4.0]}, "train_limits and deploy_limits: must have the same length"),
+        (
+            {"train_limits": ["inf"], "deploy_limits": ["inf"]},
+            "deploy_limits: must be finite, got ['inf']",
+        ),
+        ({"train_limits": [2.0]}, "train_limits: must be at least deploy_limits, [3.0], got [2.0]"),
         ({"task": "two-state"}, "task: must be a mapping of settings, got 'two-state'"),
         ({"nope": 1}, "nope: unknown key"),
         (

@@ -110,10 +110,6 @@ def test_step_towards_a_deployment_limit_of_5_by_hand(
     assert next_limit(limit, cost, 5.0, remaining=remaining) == lowered
 
 
-def test_a_dimension_that_is_never_constrained_stays_so() -> None:
-    assert next_limit(math.inf, 3.0, math.inf, remaining=2) == math.inf
-
-
 def test_steps_left_are_estimated_from_the_last_window() -> None:
     last = WindowStatistics(
         env_steps=300, episodes=6, mean_return=0.0, mean_costs=(0.0,), cost_scatter=(0.0,)

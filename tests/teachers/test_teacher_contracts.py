@@ -272,14 +272,10 @@ def test_a_gap_in_the_updates_is_an_error(name: str) -> None:
     )
 
 
-@pytest.mark.parametrize(("name", "options"), VARIANTS)
-def test_a_cost_that_is_never_constrained_stays_so(name: str, options: dict[str, Any]) -> None:
-    limits = CostLimits((math.inf, 5.0)), CostLimits((math.inf, 5.0))
-    episode = EpisodeStats(0, Phase.TRAINING, 1, 1, 0.0, (3.0, 3.0), limits[1], 0.0)
-    reports = tuple(ProgressReport(update, update, (episode,)) for update in range(1, 120))
-    for step, _ in played(TeacherSpec(name, options, *limits, TRAIN_STEPS), reports):
-        assert step.limits[0] == math.inf
-        assert step.start_limits is not None
+def test_an_infinite_deployment_limit_is_an_error() -> None:
+    with pytest.raises(ValueError) as error:
+        TeacherSpec("linear", {}, CostLimits((math.inf, 5.0)), CostLimits((math.inf, 5.0)), TRAIN_STEPS)
+    assert str(error.value) == "deploy_limits must be finite, got ['inf', 5.0]"
 
 
 STATE: dict[str, Any] = {"update": 0}
