@@ -132,11 +132,11 @@ class AnswerCheck:
         """
         match answer:
             case (CurriculumStep() as step, Mapping() as state):
-                self._check_limits(step, before, f"after update {update}" if update else "at the start")
                 if problem := _not_json(dict(state), "state"):
                     raise TypeError(
                         f"curriculum {self.curriculum}: {problem}; a state holds JSON values only"
                     )
+                self._check_limits(step, before, f"after update {update}" if update else "at the start")
                 return step, state
         got = (
             ", ".join(type(one).__name__ for one in answer)

@@ -61,7 +61,8 @@ class RayExecutor:
     """``Executor`` that runs trials in parallel on Ray.
 
     Attributes:
-        address: an existing cluster (``auto``, ``host:port``) to use instead.
+        address: an existing cluster (``auto``, ``host:port``); None for one on this machine, with all cores
+            that this process may use.
         ship_package: whether to send recrl itself to that cluster's nodes.
         resources: of the grid. Without a ``max_concurrent`` as many trials run as fit at the start.
         max_failures: largest number of restarts after the death of a trial's process, at least 0.

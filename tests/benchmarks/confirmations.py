@@ -3,7 +3,7 @@
     python -m tests.benchmarks.confirmations results/safety-gym/button-confirm.csv \
         --earlier results/safety-gym/curricula-today.csv results/safety-gym/table.csv
 
-The tables are those of ``final_policies.py``; one task of the first has a rule. Printed are the
+The tables are those of ``final_policies.py``; the first one's name says which rule it has. Printed are the
 conditions of the rule, for ppo-lag's final stochastic policies. Then come the differences of linear from
 none in return and cost, with 95% intervals, paired (Student) and as two groups (Welch): of these seeds, of
 these with the first earlier table if there is one, and of all. A table whose seeds suggested the question
@@ -19,7 +19,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from recrl.analysis.statistics.intervals import group_difference, paired_difference
+from recrl.analysis.statistics.intervals import Difference, group_difference, paired_difference
 from tests.benchmarks.velocity_table import Cell
 
 AGENT, LIMIT, METHODS = "ppo-lag", 25.0, ["none", "linear"]
@@ -35,9 +35,20 @@ def every_pair_earns_more(seeds: pd.DataFrame) -> tuple[bool, str]:
 
 def groups_earn_less(seeds: pd.DataFrame) -> tuple[bool, str]:
     """Whether linear earns less than none, by the 95% interval for two independent groups."""
+    it, said = _difference_of_groups(seeds)
+    return it.high < 0.0, said
+
+
+def groups_earn_less_or_more(seeds: pd.DataFrame) -> tuple[bool, str]:
+    """Whether linear earns less or more than none, by the same interval."""
+    it, said = _difference_of_groups(seeds)
+    return it.high < 0.0 or it.low > 0.0, said
+
+
+def _difference_of_groups(seeds: pd.DataFrame) -> tuple[Difference, str]:
     it = group_difference(*(seeds["return", method].to_numpy() for method in reversed(METHODS)))
     said = f"return under linear above none, two groups: {it.estimate:.2f} ({it.low:.2f} to {it.high:.2f})"
-    return it.high < 0.0, f"{said}, p = {it.p_value:.2g}"
+    return it, f"{said}, p = {it.p_value:.2g}"
 
 
 @dataclass(frozen=True)
@@ -45,18 +56,21 @@ class Rule:
     """What was planned.
 
     Attributes:
+        task: on which ppo-lag is judged.
         seeds: of both curricula.
         condition: on the returns, and a sentence about it. The other one is on linear's mean cost.
     """
 
+    task: str
     seeds: list[int]
     condition: Callable[[pd.DataFrame], tuple[bool, str]]
 
 
 RULES = {
-    "CarButton2": Rule([120, 121, 122], every_pair_earns_more),
-    "CarGoal2": Rule([120, 121, 122, 123, 124, 125], groups_earn_less),
-    "CarGoal1": Rule([117, 118, 119], groups_earn_less),
+    "button-confirm": Rule("CarButton2", [120, 121, 122], every_pair_earns_more),
+    "goal-confirm": Rule("CarGoal2", [120, 121, 122, 123, 124, 125], groups_earn_less),
+    "level1": Rule("CarGoal1", [117, 118, 119], groups_earn_less),
+    "long-curricula": Rule("CarGoal2", [126, 127, 128, 129, 130, 131], groups_earn_less_or_more),
 }
 
 
@@ -102,11 +116,11 @@ def main() -> None:
     parser.add_argument("--earlier", type=Path, nargs="+", default=[])
     given = parser.parse_args()
     fresh = pd.read_csv(given.fresh)
-    [task] = RULES.keys() & set(fresh["task"])
+    rule = RULES[given.fresh.stem]
     everything = pd.concat([fresh, *map(pd.read_csv, given.earlier)], keys=range(1 + len(given.earlier)))
-    of_question = everything[(everything["task"] == task) & (everything["agent"] == AGENT)]
+    of_question = everything[(everything["task"] == rule.task) & (everything["agent"] == AGENT)]
     of_question = of_question[of_question["method"].isin(METHODS)]
-    print("\n".join(verdict(of_question.loc[[0]], RULES[task])))
+    print("\n".join(verdict(of_question.loc[[0]], rule)))
     for policy in ("stochastic", "deterministic"):
         for last in range(1 + len(given.earlier)):
             seeds = pairs(of_question.loc[:last], policy)

@@ -71,7 +71,8 @@ def kinds_of_policy(rows: pd.DataFrame) -> Iterator[str]:
     Args:
         rows: of ``judged``.
     """
-    wide = rows.pivot(index=[*PAIR, "method"], columns="policy", values="solved").astype(bool)
+    wide = rows.pivot(index=[*PAIR, "method"], columns="policy", values="solved")
+    wide = wide[["average", "last"]].dropna().astype(bool)
     for agent, trials in wide.groupby("agent"):
         average, last = trials["average"], trials["last"]
         counts = int((average & ~last).sum()), int((last & ~average).sum())

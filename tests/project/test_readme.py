@@ -30,6 +30,13 @@ DEFINITIONS = {
         "120": "a count, see test_the_table_of_rivergrid_is_counted",
     },
 }
+# Curriculum and map of the first claims in the answer about RiverGrid.
+CLAIMED = [
+    ("none", "rivergrid-1a"),
+    ("dynamic", "rivergrid-1a"),
+    ("none", "rivergrid-1b"),
+    ("dynamic", "rivergrid-1b"),
+]
 NUMBER = re.compile(r"(?<![\w.,/-])-?\d[\d,]*(?:\.\d+)*(?:e-?\d+)?%?(?![\w/-])")
 MEASURED = re.compile(r"[.%,e]|\d{3}")  # small whole numbers are mostly counts of things
 
@@ -116,6 +123,25 @@ def test_the_table_of_rivergrid_is_counted() -> None:
     assert not solved.loc["rivergrid-1b", ["linear", "cosine", "exponential"]].to_numpy().any()
     assert solved.loc["rivergrid-1a", ["linear", "cosine", "exponential"]].to_numpy().all()
     assert f"static curricula solve 1a in {len(on_1b)} of {len(on_1b)} trials and 1b in none." in README
+
+
+def test_the_claims_about_rivergrid_are_counted() -> None:
+    """The table in the answer: dynamic and none with fresh seeds, static curricula with earlier ones."""
+    fresh, earlier = outcomes("confirm"), outcomes("today")
+    rows = pd.read_csv(ROOT / "results/rivergrid/today.csv").query("policy == 'average'")
+    static = ["linear", "cosine", "exponential"]
+    on_1b = rows[(rows["task"] == "rivergrid-1b") & rows["method"].isin(static)]
+    violations = (on_1b["cost"] > 1.01 * on_1b["limit"]).groupby(on_1b["agent"]).sum()
+    answer = CLAIMS.split("\nSo `dynamic`")[0]
+    for i, agent in enumerate(("ppo-lag", "cpo")):
+        counts = [fresh[method].groupby(["task", "agent"]).sum()[task, agent] for method, task in CLAIMED]
+        on_1a = [earlier[it].groupby(["task", "agent"]).sum()["rivergrid-1a", agent] for it in static]
+        counts += [sum(on_1a), violations[agent]]
+        cells = [line.split(" | ")[2 + i] for line in answer.split("\n") if line.startswith("| ")][1:]
+        assert [int(re.findall(r"\d+", it)[0]) for it in cells] == counts
+    failed = pd.read_csv(ROOT / "results/rivergrid/confirm.csv").query("policy == 'average' & agent == 'cpo'")
+    failed = failed.query("task == 'rivergrid-1a' & method == 'none' & `return` < 9.3")
+    assert f"{len(failed)} earn {failed['return'].min():.1f} to {failed['return'].max():.1f}" in answer
 
 
 def test_the_table_of_fresh_seeds_on_rivergrid_is_counted() -> None:

@@ -163,6 +163,7 @@ def test_teachers_import_neither_torch_nor_gymnasium() -> None:
             "train_limits and deploy_limits must have one entry per cost, got 1 and 2",
         ),
         ((4.0,), (5.0,), 1, "train_limits must be at least deploy_limits (d_t >= d_d), got 4.0 < 5.0"),
+        ((math.inf, 5.0), (math.inf, 5.0), 1, "deploy_limits must be finite, got ['inf', 5.0]"),
         ((5.0,), (5.0,), 0, "train_steps must be at least 1, got 0"),
     ],
 )
