@@ -36,6 +36,7 @@ CONTROLS = ("controls", "early-landing", "short-training")  # with rows of the d
 AGENTS = ("ppo-lag", "cpo")
 TASKS = ("CarGoal2", "CarButton2", "CarPush2")
 LEVEL_1 = "level1"
+PAPER_PRESET = "paper-preset"
 LEVEL_1_TASKS = ("CarGoal1", "CarButton1", "CarPush1")
 STEPS_UNDER_LIMIT = ("none", "none-short", "linear", "linear-early")  # differ in these on CarGoal2
 NOISE = ("none", "dynamic", "dynamic-without-noise")
@@ -217,7 +218,10 @@ def tables() -> Iterator[tuple[Path, str, list[str]]]:
         (DETAILS, "claims", claims(pd.read_csv(RESULTS / CLAIMS))),
         (DETAILS, "pilot", policies(seen)),
         (DETAILS, "deployment phase", deployment_phase(phase)),
-        *((DETAILS, name, policies(rows_of(f"{name}.csv"))) for name in (*CONFIRMATIONS, LEVEL_1)),
+        *(
+            (DETAILS, name, policies(rows_of(f"{name}.csv")))
+            for name in (*CONFIRMATIONS, LEVEL_1, PAPER_PRESET)
+        ),
         (DETAILS, "steps under the limit", policies(of_question(everything, STEPS_UNDER_LIMIT))),
         (DETAILS, "noise", policies(of_question(current, NOISE, TASKS))),
     )

@@ -33,6 +33,7 @@ from tests.benchmarks.safety_gym_pages import (
     LEVEL_1,
     MULTIPLIERS,
     NOISE,
+    PAPER_PRESET,
     PILOT,
     POLICIES,
     RESULTS,
@@ -70,7 +71,7 @@ def archive_of(name: str) -> Path:
 def write_rows_and_tests(archives: Mapping[str, Path]) -> None:
     """Write the rows of the table, and the tests."""
     scripts = "../../tests/benchmarks"
-    finals = {**archives, **{name: archive_of(name) for name in (*CONFIRMATIONS, LEVEL_1)}}
+    finals = {**archives, **{name: archive_of(name) for name in (*CONFIRMATIONS, LEVEL_1, PAPER_PRESET)}}
     rows = [f"{scripts}/final_policies.py {path} --to {it}.csv" for it, path in finals.items()]
     phases = [
         f"{scripts}/deployment_phase.py {path} --to {it}-deployment-phase.csv"
@@ -194,9 +195,12 @@ def main() -> None:
         for policy in POLICIES:
             counts += limit_counts(rows_of(*names), policy)
     (RESULTS / "table-limit.txt").write_text("\n".join([*counts, ""]))
-    curve(of_question(updates, STEPS_UNDER_LIMIT)).to_csv(
-        RESULTS / "steps-under-limit-curve.csv", index=False
-    )
+    curves = {
+        "steps-under-limit-curve": of_question(updates, STEPS_UNDER_LIMIT),
+        f"{PAPER_PRESET}-learning": recrl.load_sweep(archive_of(PAPER_PRESET)).updates,
+    }
+    for name, of_curve in curves.items():
+        curve(of_curve).to_csv(RESULTS / f"{name}.csv", index=False)
     safety_gym_pages.main()
 
 
