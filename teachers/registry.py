@@ -36,7 +36,8 @@ class TeacherKind:
     Attributes:
         summary: one sentence of description.
         config: the pydantic model of its options.
-        make: builds it, from options that ``config`` has accepted.
+        make: builds it. ``config`` has accepted the options, but they are as given, without defaults:
+            ``config.model_validate`` adds these.
         measures_start: whether it measures an infinite d_t, as a mean cost, as ``StartMeasurement`` does.
             Otherwise ``start_limits`` that come after the first step are an error.
         compares_costs: whether it compares mean costs of episodes with its limits.

@@ -117,7 +117,7 @@ class SavedTrial:
             num_episodes: for each, at least 1.
             seed: of the environments and the policy, at least 0; None for the trial's own.
         """
-        rows = evaluated_rows(self.policy, self.spec, policies, num_episodes=num_episodes, seed=seed)
+        rows = evaluate_saved(self.policy, self.spec, policies, num_episodes=num_episodes, seed=seed)
         path = self.store.evaluations_folder / f"{self._file_name(seed)}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
         text = rows_text(rows)
@@ -190,7 +190,7 @@ class SavedTrial:
         return f"step {shot.step}   return {shot.episode_return:.1f}   {costs}"
 
 
-def evaluated_rows(
+def evaluate_saved(
     policy: FinalPolicy,
     spec: TrialSpec,
     policies: Sequence[FrozenPolicy],

@@ -266,7 +266,7 @@ class Policy:
         import pandas as pd  # noqa: PLC0415
 
         from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415
-        from recrl.orchestrator.trial.saved_policy import evaluated_rows  # noqa: PLC0415
+        from recrl.orchestrator.trial.saved_policy import evaluate_saved  # noqa: PLC0415
 
         if episodes < 1:
             raise ValueError(f"episodes: must be at least 1, got {episodes}")
@@ -274,7 +274,7 @@ class Policy:
             raise ValueError(f"seed: must be at least 0 or None, got {seed}")
         kind = FrozenPolicy.DETERMINISTIC if deterministic else FrozenPolicy.STOCHASTIC
         with modules_here():
-            rows = evaluated_rows(self.final, self.spec, (kind,), num_episodes=episodes, seed=seed)
+            rows = evaluate_saved(self.final, self.spec, (kind,), num_episodes=episodes, seed=seed)
         return pd.DataFrame(rows).drop(columns="policy")
 
     def make_env(self) -> gymnasium.Env[Any, Any]:
