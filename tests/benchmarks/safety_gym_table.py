@@ -31,6 +31,7 @@ from tests.benchmarks.safety_gym_pages import (
     CONTROLS,
     FRESH,
     LEVEL_1,
+    LONG,
     MULTIPLIERS,
     NOISE,
     PAPER_PRESET,
@@ -48,7 +49,7 @@ from tests.benchmarks.safety_gym_pages import (
 LIMIT = 25.0
 COLOURS = 128  # of a figure in the documentation
 TABLE_PARTS = ("table", "table-cpo")  # one archive would be too large for the repository
-PERIOD = 250_000  # steps, of a curve
+PERIOD, LONG_PERIOD = 250_000, 2_000_000  # steps, of a curve
 LABELS = ("ppo-lag min-std", "cpo")  # of each agent in the tables for the power
 COUNTED = ("agents.csv", *PILOT, "margin-control.csv", FRESH, "button-confirm.csv")  # for the power
 
@@ -71,11 +72,14 @@ def archive_of(name: str) -> Path:
 def write_rows_and_tests(archives: Mapping[str, Path]) -> None:
     """Write the rows of the table, and the tests."""
     scripts = "../../tests/benchmarks"
-    finals = {**archives, **{name: archive_of(name) for name in (*CONFIRMATIONS, LEVEL_1, PAPER_PRESET)}}
+    finals = {
+        **archives,
+        **{name: archive_of(name) for name in (*CONFIRMATIONS, LEVEL_1, PAPER_PRESET, LONG)},
+    }
     rows = [f"{scripts}/final_policies.py {path} --to {it}.csv" for it, path in finals.items()]
     phases = [
         f"{scripts}/deployment_phase.py {path} --to {it}-deployment-phase.csv"
-        for it, path in archives.items()
+        for it, path in {**archives, LONG: archive_of(LONG)}.items()
     ]
     transcript([*rows, *phases])
     tests = [
@@ -126,9 +130,9 @@ def control_differences(rows: pd.DataFrame, baselines: Sequence[str]) -> Iterato
                     yield table.drop(columns="p_holm").round(3).to_string(index=False)
 
 
-def curve(updates: pd.DataFrame) -> pd.DataFrame:
-    """Return means over seeds and over the updates that end in each PERIOD steps, by curriculum."""
-    begin = (updates["end_step"] - 1) // PERIOD * PERIOD
+def curve(updates: pd.DataFrame, period: int = PERIOD) -> pd.DataFrame:
+    """Return means over seeds and over the updates that end in each ``period`` steps, by curriculum."""
+    begin = (updates["end_step"] - 1) // period * period
     columns = ["episode_return", "cost_0", "limit_0", "multiplier_0"]
     means = updates.assign(from_step=begin).groupby(["method", "from_step"], observed=True)[columns].mean()
     return means.round(2).reset_index()
@@ -195,12 +199,14 @@ def main() -> None:
         for policy in POLICIES:
             counts += limit_counts(rows_of(*names), policy)
     (RESULTS / "table-limit.txt").write_text("\n".join([*counts, ""]))
+    of_archive = {it: recrl.load_sweep(archive_of(it)).updates for it in (PAPER_PRESET, LONG)}
     curves = {
-        "steps-under-limit-curve": of_question(updates, STEPS_UNDER_LIMIT),
-        f"{PAPER_PRESET}-learning": recrl.load_sweep(archive_of(PAPER_PRESET)).updates,
+        "steps-under-limit-curve": curve(of_question(updates, STEPS_UNDER_LIMIT)),
+        f"{PAPER_PRESET}-learning": curve(of_archive[PAPER_PRESET]),
+        f"{LONG}-learning": curve(of_archive[LONG], LONG_PERIOD),
     }
-    for name, of_curve in curves.items():
-        curve(of_curve).to_csv(RESULTS / f"{name}.csv", index=False)
+    for name, rows in curves.items():
+        rows.to_csv(RESULTS / f"{name}.csv", index=False)
     safety_gym_pages.main()
 
 
