@@ -116,7 +116,8 @@ def main() -> None:
     parser.add_argument("--earlier", type=Path, nargs="+", default=[])
     given = parser.parse_args()
     fresh = pd.read_csv(given.fresh)
-    rule = RULES[given.fresh.stem]
+    if (rule := RULES.get(given.fresh.stem)) is None:
+        parser.error(f"{given.fresh}: has no rule; those with one are {', '.join(RULES)}")
     everything = pd.concat([fresh, *map(pd.read_csv, given.earlier)], keys=range(1 + len(given.earlier)))
     of_question = everything[(everything["task"] == rule.task) & (everything["agent"] == AGENT)]
     of_question = of_question[of_question["method"].isin(METHODS)]

@@ -53,10 +53,13 @@ def differences(rows: pd.DataFrame, control: pd.DataFrame, column: str) -> pd.Da
     return table.assign(p_holm=holm(table["p"].to_numpy()))
 
 
-def paired_differences(
+def differences_from(
     rows: pd.DataFrame, baseline: str, column: str, *, as_groups: bool = False
 ) -> pd.DataFrame:
-    """A row a task, agent and curriculum: it minus the baseline, over the two or more seeds with both."""
+    """A row a task, agent and curriculum: it minus the baseline, over the two or more seeds with both.
+
+    With ``as_groups`` the test is Welch's of two independent groups, otherwise Student's of pairs of seeds.
+    """
     wide = rows.pivot(index=["task", "agent", "seed"], columns="method", values=column)
     compare = group_difference if as_groups else paired_difference
     found = []
@@ -102,7 +105,7 @@ def main() -> None:
     if arguments.against is not None:
         for column in ("return", "cost"):
             how = "difference of two groups" if arguments.groups else "paired difference"
-            table = paired_differences(rows, arguments.against, column, as_groups=arguments.groups)
+            table = differences_from(rows, arguments.against, column, as_groups=arguments.groups)
             print(f"{column}: {how}, 95% interval, p, p corrected for all rows")
             print(table.round(3).to_string(index=False))
         return

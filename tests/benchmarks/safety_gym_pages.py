@@ -13,7 +13,7 @@ from typing import Any
 
 import pandas as pd
 
-from tests.benchmarks.differences import paired_differences
+from tests.benchmarks.differences import differences_from
 from tests.benchmarks.page_tables import replace_table
 from tests.benchmarks.velocity_table import Cell, number
 
@@ -137,7 +137,7 @@ def differences_of(rows: pd.DataFrame) -> dict[Key, str]:
 
     They are those of two groups, because equal seeds of different machines are no pairs.
     """
-    table = paired_differences(rows, "none", "return", as_groups=True)
+    table = differences_from(rows, "none", "return", as_groups=True)
     return {(row["agent"], row["task"], row["method"]): shown(row) for _, row in table.iterrows()}
 
 

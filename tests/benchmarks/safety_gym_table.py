@@ -24,7 +24,7 @@ from scipy.stats import fisher_exact
 import recrl
 from recrl.orchestrator.cli.main import main as recrl_sweep
 from tests.benchmarks import safety_gym_pages
-from tests.benchmarks.differences import paired_differences
+from tests.benchmarks.differences import differences_from
 from tests.benchmarks.safety_gym_pages import (
     CLAIMS,
     CONFIRMATIONS,
@@ -125,7 +125,7 @@ def control_differences(rows: pd.DataFrame, baselines: Sequence[str]) -> Iterato
             chosen = of_policy(rows, policy)
             for column in ("return", "cost"):
                 for baseline in baselines:
-                    table = paired_differences(chosen, baseline, column, as_groups=as_groups)
+                    table = differences_from(chosen, baseline, column, as_groups=as_groups)
                     yield f"{policy}, {column} above {baseline}, {how}: 95% interval, p (not corrected)"
                     yield table.drop(columns="p_holm").round(3).to_string(index=False)
 
