@@ -36,8 +36,8 @@ class StoppedError(Exception):
     """An evaluation was stopped before its end."""
 
 
-class FrozenPolicy(StrEnum):
-    """How an evaluated policy acts: stochastically as in training, or by its mode."""
+class PolicyKind(StrEnum):
+    """How a final policy acts: stochastically as in training, or by its mode."""
 
     STOCHASTIC = "stochastic"
     DETERMINISTIC = "deterministic"
@@ -48,11 +48,11 @@ class EvaluatedPolicy:
     """What a collector uses of a final policy."""
 
     actor: FinalPolicy
-    policy: FrozenPolicy
+    kind: PolicyKind
 
     def act(self, observations: npt.NDArray[np.float32], generator: np.random.Generator) -> npt.NDArray[Any]:
         """Choose actions; a deterministic policy leaves the generator as it is."""
-        if self.policy is FrozenPolicy.DETERMINISTIC:
+        if self.kind is PolicyKind.DETERMINISTIC:
             return self.actor.act_greedily(observations)
         return self.actor.act(observations, generator)
 
@@ -60,7 +60,7 @@ class EvaluatedPolicy:
 def evaluate(
     actor: FinalPolicy,
     environments: CMDPVectorEnv,
-    policy: FrozenPolicy,
+    kind: PolicyKind,
     *,
     num_episodes: int,
     seed: np.random.SeedSequence,
@@ -71,7 +71,7 @@ def evaluate(
     Args:
         actor: chooses the actions.
         environments: B fresh environments; they are reset here.
-        policy: stochastic or deterministic.
+        kind: stochastic or deterministic.
         num_episodes: at least 0; divided equally among the environments, the first ones run one more.
         seed: of the environments and of the policy's randomness.
         should_stop: called every ``CHUNK_STEPS`` steps; once true, ``StoppedError`` is raised.
@@ -101,7 +101,7 @@ def evaluate(
                 f"evaluation: no episode ended in {most_steps:,} steps of environment {short}; the task must "
                 "return terminated or truncated at some time (gymnasium.wrappers.TimeLimit does)"
             )
-        _, finished = collector.collect(EvaluatedPolicy(actor, policy), generator)
+        _, finished = collector.collect(EvaluatedPolicy(actor, kind), generator)
         steps += CHUNK_STEPS
         for episode in finished:
             if len(done[episode.environment]) < shares[episode.environment]:
@@ -130,7 +130,7 @@ class Shot:
 def film(
     actor: FinalPolicy,
     environment: gymnasium.Env[Any, Any],
-    policy: FrozenPolicy,
+    kind: PolicyKind,
     *,
     num_costs: int,
     seed: np.random.SeedSequence,
@@ -141,7 +141,7 @@ def film(
     Args:
         actor: chooses the actions.
         environment: a rendering environment with ``info["cost"]``, for example of ``registry.make_drawn``.
-        policy: stochastic or deterministic.
+        kind: stochastic or deterministic.
         num_costs: k.
         seed: of the environment and of the policy's randomness.
         every: steps from one frame to the next, at least 1; rendering may take longer than all else.
@@ -154,7 +154,7 @@ def film(
     """
     environment_seed, policy_seed = _spawned(seed)
     generator = np.random.default_rng(policy_seed)
-    chooser = EvaluatedPolicy(actor, policy)
+    chooser = EvaluatedPolicy(actor, kind)
     # Some simulators take signed seeds only.
     observation, _ = environment.reset(seed=int(environment_seed.generate_state(1)[0] >> 1))
     episode_return, costs = 0.0, np.zeros(num_costs)

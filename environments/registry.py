@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,7 +44,6 @@ class Task:
         optimum: callable (name, options, limits) -> J*(d), or None if it is not known.
         drawn: callable (name, options) -> one scalar Gymnasium environment with ``info["cost"]`` that renders
             (``render_mode`` is ``rgb_array``), or None.
-        sample_options: options for the contract tests: the required ones, and short episodes.
     """
 
     summary: str
@@ -52,7 +51,6 @@ class Task:
     make: str | Callable[[str, int, Any], CMDPVectorEnv]
     optimum: str | Callable[[str, Any, CostLimits], float] | None = None
     drawn: str | Callable[[str, Any], gymnasium.Env[Any, Any]] | None = None
-    sample_options: Mapping[str, Any] = field(default_factory=dict)
 
 
 SAFETY_GYM = {
@@ -70,11 +68,10 @@ def _two_state(costs: str) -> Task:
         options=f"{module}:TwoStateOptions",
         make=f"{module}:make_two_state",
         optimum=f"{module}:two_state_optimum",
-        sample_options={"arrival": 0.5},
     )
 
 
-def _river_grid(summary: str, options: str = "RiverGridOptions", **sample: Any) -> Task:
+def _river_grid(summary: str, options: str = "RiverGridOptions") -> Task:
     module = "recrl.environments.rivergrid.grid_world"
     return Task(
         summary=summary,
@@ -82,7 +79,6 @@ def _river_grid(summary: str, options: str = "RiverGridOptions", **sample: Any) 
         make=f"{module}:make_river_grid",
         optimum=f"{module}:river_grid_optimum",
         drawn="recrl.environments.rivergrid.minigrid_env:draw_river_grid",
-        sample_options={"horizon": 20, **sample},
     )
 
 
@@ -96,28 +92,20 @@ TASKS: dict[str, Task] = {
         optimum="recrl.environments.continuous_bandit:continuous_bandit_optimum",
     ),
     "rivergrid-1a": _river_grid(
-        "Our version of the paper's RiverGrid 1a: the goal is only reached through the river, cost 5.",
-        costs=("river", "turns"),
+        "Our version of the paper's RiverGrid 1a: the goal is only reached through the river, cost 5."
     ),
     "rivergrid-1b": _river_grid(
         "Our version of the paper's RiverGrid 1b: through the river, cost 5, or round it, cost 0."
     ),
-    "rivergrid": _river_grid(
-        "RiverGrid on a map of your own.",
-        "RiverGridMapOptions",
-        map="#######\n#>.~.G#\n#.%...#\n#######",
-    ),
+    "rivergrid": _river_grid("RiverGrid on a map of your own.", "RiverGridMapOptions"),
     "rivergrid-generated": _river_grid(
-        "RiverGrid on a random instance with the properties of the paper's two.",
-        "RiverGridGeneratedOptions",
-        map_seed=0,
+        "RiverGrid on a random instance with the properties of the paper's two.", "RiverGridGeneratedOptions"
     ),
     "gymnasium": Task(
         summary="Any environment that is registered with Gymnasium, by its id.",
         options="recrl.environments.gymnasium_tasks:GymnasiumOptions",
         make="recrl.environments.gymnasium_tasks:make_gymnasium",
         drawn="recrl.environments.gymnasium_tasks:draw_gymnasium",
-        sample_options={"id": "CartPole-v1", "costless": True},
     ),
     **{
         name: Task(
@@ -125,7 +113,6 @@ TASKS: dict[str, Task] = {
             options="recrl.environments.safety_gym.safety_gym_environments:SafetyGymOptions",
             make="recrl.environments.safety_gym.safety_gym_environments:make_safety_gym",
             drawn="recrl.environments.safety_gym.safety_gym_environments:draw_safety_gym",
-            sample_options={"horizon": 12},
         )
         for name, task in SAFETY_TASKS.items()
     },
@@ -136,7 +123,6 @@ TASKS: dict[str, Task] = {
             options="recrl.environments.velocity.velocity_environments:VelocityOptions",
             make="recrl.environments.velocity.velocity_environments:make_velocity",
             drawn="recrl.environments.velocity.velocity_environments:draw_velocity",
-            sample_options={"horizon": 12},
         )
         for name, task in VELOCITY_TASKS.items()
     },

@@ -287,7 +287,7 @@ def _film(
     unseen = [trial for trial, name in films if not any(trial.videos_folder.glob(name))]
     if not unseen:
         return
-    from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415
+    from recrl.agents.evaluation import PolicyKind  # noqa: PLC0415
     from recrl.orchestrator.trial.saved_policy import SavedTrial  # noqa: PLC0415  (imports torch)
     from recrl.orchestrator.trial.videos import VideoFormat  # noqa: PLC0415
 
@@ -296,6 +296,6 @@ def _film(
         if stop.is_set():
             return
         try:
-            SavedTrial.load(trial).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
+            SavedTrial.load(trial).film(PolicyKind.STOCHASTIC, VideoFormat.GIF, seed=None)
         except RecrlError as error:  # a failed video is no failure of the sweep
             listener.failed_to_film(error)

@@ -23,7 +23,7 @@ from recrl.orchestrator.tracking.mlflow_sync import last_report, sync, without_e
 from recrl.orchestrator.trial_warnings import code_warnings
 
 if TYPE_CHECKING:
-    from recrl.agents.evaluation import FrozenPolicy
+    from recrl.agents.evaluation import PolicyKind
     from recrl.orchestrator.trial.saved_policy import SavedEvaluation, SavedTrial
     from recrl.orchestrator.trial.videos import VideoFormat
 
@@ -32,13 +32,13 @@ DEFAULT_EPISODES = 100  # episodes, for trials without an evaluation of their ow
 
 def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
     """Evaluate the policies of trials for whole episodes, and film them on request."""
-    from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415  (imports gymnasium)
+    from recrl.agents.evaluation import PolicyKind  # noqa: PLC0415  (imports gymnasium)
     from recrl.orchestrator.trial.videos import VideoFormat  # noqa: PLC0415
 
     store = open_store(request, checkpoints=True)
     chosen, orphans = _chosen(store, request)
-    policies = tuple(FrozenPolicy) if request.policy == "both" else (FrozenPolicy(request.policy),)
-    evaluated, left_out = _evaluate(chosen, policies, request)
+    kinds = tuple(PolicyKind) if request.policy == "both" else (PolicyKind(request.policy),)
+    evaluated, left_out = _evaluate(chosen, kinds, request)
     if not evaluated:
         raise left_out[0]
     _show(evaluated, console)
@@ -50,14 +50,14 @@ def run_evaluate(request: EvaluateRequest, console: Console) -> ExitCode:
     _warn_of_other_code(trials, console)
     missing_videos = 0
     if request.video:
-        kind = VideoFormat(request.video)
-        missing_videos = sum(_film(saved, policies, kind, request.seed, console) for saved in trials)
+        video_format = VideoFormat(request.video)
+        missing_videos = sum(_film(saved, kinds, video_format, request.seed, console) for saved in trials)
     _tell_mlflow(store, request, console)
     return ExitCode.TRIALS_FAILED if left_out or missing_videos else ExitCode.OK
 
 
 def _evaluate(
-    chosen: Sequence[TrialStore], policies: Sequence[FrozenPolicy], request: EvaluateRequest
+    chosen: Sequence[TrialStore], kinds: Sequence[PolicyKind], request: EvaluateRequest
 ) -> tuple[list[tuple[SavedTrial, SavedEvaluation]], list[RecrlError]]:
     """Return the trials that can be evaluated with their evaluations, and why others cannot."""
     from recrl.orchestrator.trial.saved_policy import SavedTrial  # noqa: PLC0415  (imports torch)
@@ -68,7 +68,7 @@ def _evaluate(
             trial.require_whole()
             saved = SavedTrial.load(trial)
             num_episodes = request.episodes or saved.spec.evaluation_episodes or DEFAULT_EPISODES
-            evaluation = saved.evaluate(policies, num_episodes=num_episodes, seed=request.seed)
+            evaluation = saved.evaluate(kinds, num_episodes=num_episodes, seed=request.seed)
         except RecrlError as error:
             left_out.append(error)
         else:
@@ -107,13 +107,17 @@ def _warn_of_other_code(evaluated: Sequence[SavedTrial], console: Console) -> No
 
 
 def _film(
-    saved: SavedTrial, policies: Sequence[FrozenPolicy], kind: VideoFormat, seed: int | None, console: Console
+    saved: SavedTrial,
+    kinds: Sequence[PolicyKind],
+    video_format: VideoFormat,
+    seed: int | None,
+    console: Console,
 ) -> int:
     """Film a trial's policies, and print the places; return how many films failed, which stop no other."""
     failed = 0
-    for policy in policies:
+    for kind in kinds:
         try:
-            video = saved.film(policy, kind, seed=seed)
+            video = saved.film(kind, video_format, seed=seed)
         except RecrlError as error:
             say(console, f"no video   {error}")
             failed += 1

@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 from recrl.agents.agent import FinalPolicy, final_policy
-from recrl.agents.evaluation import FrozenPolicy, Shot, film
+from recrl.agents.evaluation import PolicyKind, Shot, film
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CMDPSpec
 from recrl.environments.plugins import UntrustedNameError
@@ -108,29 +108,29 @@ class SavedTrial:
             ) from error
 
     def evaluate(
-        self, policies: Sequence[FrozenPolicy], *, num_episodes: int, seed: int | None
+        self, kinds: Sequence[PolicyKind], *, num_episodes: int, seed: int | None
     ) -> SavedEvaluation:
         """Evaluate the policy for whole episodes, and write a file with a row an episode.
 
         Args:
-            policies: stochastic, deterministic or both; at least one.
+            kinds: stochastic, deterministic or both; at least one.
             num_episodes: for each, at least 1.
             seed: of the environments and the policy, at least 0; None for the trial's own.
         """
-        rows = evaluate_saved(self.policy, self.spec, policies, num_episodes=num_episodes, seed=seed)
+        rows = evaluate_saved(self.policy, self.spec, kinds, num_episodes=num_episodes, seed=seed)
         path = self.store.evaluations_folder / f"{self._file_name(seed)}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
         text = rows_text(rows)
-        differs = path.exists() and path.read_bytes() != text  # another number of episodes, or other policies
+        differs = path.exists() and path.read_bytes() != text  # another number of episodes, or other kinds
         earlier = self.store.move_aside(path) if differs else None
         write_atomically(path, text)
         return SavedEvaluation(pd.DataFrame(rows), path, earlier)
 
-    def film(self, policy: FrozenPolicy, video_format: VideoFormat, *, seed: int | None) -> Path:
+    def film(self, kind: PolicyKind, video_format: VideoFormat, *, seed: int | None) -> Path:
         """Film one episode, with its return and costs below the frames.
 
         Args:
-            policy: stochastic or deterministic.
+            kind: stochastic or deterministic.
             video_format: GIF or MP4.
             seed: of the environment and the policy, at least 0; None for the trial's own.
 
@@ -140,7 +140,7 @@ class SavedTrial:
         Raises:
             RecrlError: the task cannot be rendered, or this machine cannot render or encode it.
         """
-        path, task = self.video_path(policy, video_format, seed=seed), self.spec.task
+        path, task = self.video_path(kind, video_format, seed=seed), self.spec.task
         try:
             environment = make_drawn(task.name, options=task.options)
         except NotDrawnError as error:
@@ -153,7 +153,7 @@ class SavedTrial:
             shots = film(
                 self.policy,
                 environment,
-                policy,
+                kind,
                 num_costs=self.cmdp.num_costs,
                 seed=_seed_sequence(self.spec, seed),
                 every=every,
@@ -173,9 +173,9 @@ class SavedTrial:
                 logger.warning("%s raised an error when it was closed: %s", task.name, described(error))
         return path
 
-    def video_path(self, policy: FrozenPolicy, video_format: VideoFormat, *, seed: int | None) -> Path:
+    def video_path(self, kind: PolicyKind, video_format: VideoFormat, *, seed: int | None) -> Path:
         """Return the path of the video of ``film``."""
-        return self.store.videos_folder / f"{self._file_name(seed)}__{policy}.{video_format}"
+        return self.store.videos_folder / f"{self._file_name(seed)}__{kind}.{video_format}"
 
     def _file_name(self, seed: int | None) -> str:
         return f"{of_update(self.update)}__seed-{'own' if seed is None else seed}"
@@ -193,7 +193,7 @@ class SavedTrial:
 def evaluate_saved(
     policy: FinalPolicy,
     spec: TrialSpec,
-    policies: Sequence[FrozenPolicy],
+    kinds: Sequence[PolicyKind],
     *,
     num_episodes: int,
     seed: int | None,
@@ -203,7 +203,7 @@ def evaluate_saved(
     Args:
         policy: chooses the actions.
         spec: of the trial.
-        policies: stochastic, deterministic or both; at least one.
+        kinds: stochastic, deterministic or both; at least one.
         num_episodes: for each, at least 1.
         seed: of the environments and the policy, at least 0; None for the trial's own.
 
@@ -212,7 +212,7 @@ def evaluate_saved(
     """
     try:
         return evaluation_rows(
-            policy, spec, policies, num_episodes=num_episodes, seed=_seed_sequence(spec, seed)
+            policy, spec, kinds, num_episodes=num_episodes, seed=_seed_sequence(spec, seed)
         )
     except USERS_ERRORS as error:
         raise RecrlError(f"{spec.title}: cannot be evaluated: {described(error)}") from error
@@ -223,7 +223,7 @@ def _seed_sequence(spec: TrialSpec, seed: int | None) -> np.random.SeedSequence:
 
 
 def summary(rows: pd.DataFrame, saved: SavedTrial) -> list[dict[str, Any]]:
-    """Summarise an evaluation as text, one row per policy.
+    """Summarise an evaluation as text, one row per kind of policy.
 
     Means have standard errors, several costs their names; ``within`` is the fraction of the episodes in which
     no cost exceeded its d_d.
@@ -232,8 +232,8 @@ def summary(rows: pd.DataFrame, saved: SavedTrial) -> list[dict[str, Any]]:
     names = [f"{name} " for name in saved.cmdp.cost_names] if len(costs) > 1 else [""]
     limits = saved.spec.deploy_limits.array
     table = []
-    for policy in FrozenPolicy:
-        episodes = rows[rows["policy"] == policy]
+    for kind in PolicyKind:
+        episodes = rows[rows["policy"] == kind]
         if episodes.empty:
             continue
         within = float((episodes[costs].to_numpy() <= limits).all(axis=1).mean())
@@ -241,7 +241,7 @@ def summary(rows: pd.DataFrame, saved: SavedTrial) -> list[dict[str, Any]]:
             {
                 "trial": saved.spec.title,
                 "update": f"{saved.update} of {saved.spec.num_updates}",
-                "policy": policy.value,
+                "policy": kind.value,
                 "episodes": str(len(episodes)),
                 "return": _mean_text(episodes["episode_return"]),
                 "costs": ", ".join(

@@ -31,7 +31,7 @@ from recrl.agents.agent import (
     learns_rewarded_entropy,
 )
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
-from recrl.agents.evaluation import FrozenPolicy, evaluate
+from recrl.agents.evaluation import PolicyKind, evaluate
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Floats, Phase
 from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
@@ -188,7 +188,7 @@ class Trial:
         rows = evaluation_rows(
             policy,
             spec,
-            tuple(FrozenPolicy),
+            tuple(PolicyKind),
             num_episodes=spec.evaluation_episodes,
             seed=self._evaluation_seed,
             should_stop=should_stop,
@@ -345,7 +345,7 @@ def close(environments: CMDPVectorEnv) -> None:
 def evaluation_rows(
     actor: FinalPolicy,
     spec: TrialSpec,
-    policies: Sequence[FrozenPolicy],
+    kinds: Sequence[PolicyKind],
     *,
     num_episodes: int,
     seed: np.random.SeedSequence,
@@ -356,7 +356,7 @@ def evaluation_rows(
     Args:
         actor: chooses the actions.
         spec: the trial.
-        policies: stochastic, deterministic or both, each evaluated on the same environment stream.
+        kinds: stochastic, deterministic or both, each evaluated on the same environment stream.
         num_episodes: of each, at least 0. If they are fewer than the trial's environments, only as many
             environments are made as there are episodes.
         seed: of the environments and of the policy's randomness.
@@ -364,19 +364,19 @@ def evaluation_rows(
     """
     rows = []
     num_envs = max(1, min(spec.num_envs, num_episodes))
-    for policy in policies:
+    for kind in kinds:
         with open_environments(spec, num_envs) as environments:
             episodes = evaluate(
                 actor,
                 environments,
-                policy,
+                kind,
                 num_episodes=num_episodes,
                 seed=seed,
                 should_stop=should_stop,
             )
         rows += [
             {
-                "policy": policy,
+                "policy": kind,
                 "index": index,
                 "length": episode.length,
                 "episode_return": episode.episode_return,

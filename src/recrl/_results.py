@@ -265,14 +265,14 @@ class Policy:
         """
         import pandas as pd  # noqa: PLC0415
 
-        from recrl.agents.evaluation import FrozenPolicy  # noqa: PLC0415
+        from recrl.agents.evaluation import PolicyKind  # noqa: PLC0415
         from recrl.orchestrator.trial.saved_policy import evaluate_saved  # noqa: PLC0415
 
         if episodes < 1:
             raise ValueError(f"episodes: must be at least 1, got {episodes}")
         if seed is not None and seed < 0:
             raise ValueError(f"seed: must be at least 0 or None, got {seed}")
-        kind = FrozenPolicy.DETERMINISTIC if deterministic else FrozenPolicy.STOCHASTIC
+        kind = PolicyKind.DETERMINISTIC if deterministic else PolicyKind.STOCHASTIC
         with modules_here():
             rows = evaluate_saved(self.final, self.spec, (kind,), num_episodes=episodes, seed=seed)
         return pd.DataFrame(rows).drop(columns="policy")

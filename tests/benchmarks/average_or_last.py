@@ -17,7 +17,7 @@ import pandas as pd
 import torch
 
 from recrl.agents.agent import FinalPolicy, final_policy
-from recrl.agents.evaluation import FrozenPolicy
+from recrl.agents.evaluation import PolicyKind
 from recrl.agents.learning.actor_critic import ActorCritic
 from recrl.agents.registry import make_agent
 from recrl.environments.finite.exact_solver import evaluate_policy
@@ -52,7 +52,7 @@ def value(policy: FinalPolicy, spec: TrialSpec, episodes: int | None) -> dict[st
     rows = evaluation_rows(
         policy,
         spec,
-        [FrozenPolicy.STOCHASTIC],
+        [PolicyKind.STOCHASTIC],
         num_episodes=episodes or spec.evaluation_episodes,
         seed=TrialSeeds.of(spec).evaluation,
     )

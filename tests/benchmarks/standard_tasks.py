@@ -25,7 +25,7 @@ import pandas as pd
 import torch
 
 from recrl.agents.collection import Collector, episode_costs
-from recrl.agents.evaluation import FrozenPolicy, evaluate
+from recrl.agents.evaluation import PolicyKind, evaluate
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
@@ -87,7 +87,7 @@ def learn(curve: Curve, seed: int) -> tuple[pd.DataFrame, dict[str, Any]]:
             earned = float(np.mean([episode.episode_return for episode in episodes]))
             rows.append((curve.task, seed, update * steps_per_update, earned))
     final: dict[str, Any] = {"task": curve.task, "seed": seed, "cpu_seconds": time.process_time() - start}
-    for policy in FrozenPolicy:
+    for policy in PolicyKind:
         fresh = make_vector("gymnasium", curve.num_envs, options=options)
         episodes = evaluate(agent, fresh, policy, num_episodes=100, seed=test_seed)
         final[str(policy)] = float(np.mean([episode.episode_return for episode in episodes]))

@@ -20,14 +20,14 @@ import pandas as pd
 import torch
 
 from recrl.agents.collection import Collector
-from recrl.agents.evaluation import EvaluatedPolicy, FrozenPolicy
+from recrl.agents.evaluation import EvaluatedPolicy, PolicyKind
 from recrl.environments.registry import make_vector
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.trial.saved_policy import SavedTrial
 
 
 def outcomes(
-    trial: SavedTrial, policy: FrozenPolicy, *, limit: float, number: int, seed: int
+    trial: SavedTrial, policy: PolicyKind, *, limit: float, number: int, seed: int
 ) -> dict[str, Any]:
     """Mean returns and first costs of the same episodes, with and without the stop."""
     task = trial.spec.task
@@ -64,7 +64,7 @@ def rows_of(sweep: Path, *, limit: float, number: int, seed: int) -> Iterator[di
             "seed": spec.seed,
             "steps": trial.env_steps,
         }
-        for policy in FrozenPolicy:
+        for policy in PolicyKind:
             yield (
                 keys
                 | {"policy": policy.value}

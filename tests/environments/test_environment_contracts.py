@@ -13,27 +13,15 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 from gymnasium.vector import AutoresetMode
 
-from recrl.environments.registry import TASKS, find_task, make_vector, task_options
+from recrl.environments.registry import TASKS, make_vector
 from recrl.environments.vector import CMDPVectorEnv
 from recrl.orchestrator.files.checkpoint_format import decode, encode
+from tests.environments.sample_options import SHORT_HORIZON, has_horizon, sample_options
 
 NUM_ENVS = 3
-SHORT_HORIZON = 12
 Transition = tuple[Any, Any, Any, Any, dict[str, Any]]
 
 pytestmark = pytest.mark.parametrize("name", TASKS)
-
-
-def sample_options(name: str, **overrides: Any) -> dict[str, Any]:
-    """Short episodes, and whatever the task requires."""
-    options = dict(find_task(name).sample_options)
-    if has_horizon(name):
-        options.setdefault("horizon", SHORT_HORIZON)
-    return {**options, **overrides}
-
-
-def has_horizon(name: str) -> bool:
-    return "horizon" in type(task_options(name, find_task(name).sample_options)).model_fields
 
 
 def build(name: str, num_envs: int = NUM_ENVS, **overrides: Any) -> CMDPVectorEnv:

@@ -18,6 +18,7 @@ from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
 from recrl.environments.plugins import MODULES, UnknownNameError, load_attribute, modules_in
 from recrl.environments.registry import TASKS, find_task, make_vector, optimal_return, task_options
 from recrl.environments.rivergrid.maps import MAPS, parse_map
+from tests.environments.sample_options import sample_options
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -34,9 +35,7 @@ def test_everything_a_task_refers_to_exists_and_explains_itself(name: str) -> No
 
 @pytest.mark.parametrize("name", [name for name, task in TASKS.items() if task.optimum is not None])
 def test_a_looser_limit_never_lowers_the_optimum(name: str) -> None:
-    options = dict(TASKS[name].sample_options)
-    if "horizon" in type(task_options(name, options)).model_fields:
-        options["horizon"] = 12
+    options = sample_options(name)
     num_costs = make_vector(name, 1, options=options).cmdp.num_costs
     optima = [
         optimal_return(name, options, CostLimits((limit,) * num_costs)) for limit in (0.0, 0.5, 2.0, math.inf)

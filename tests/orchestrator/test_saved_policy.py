@@ -16,9 +16,9 @@ from PIL import Image
 
 from recrl.agents import evaluation
 from recrl.agents.collection import Collector
-from recrl.agents.evaluation import FrozenPolicy, evaluate, film
+from recrl.agents.evaluation import PolicyKind, evaluate, film
 from recrl.environments.cmdp import CostLimits
-from recrl.environments.registry import TASKS, make_drawn, make_vector
+from recrl.environments.registry import make_drawn, make_vector
 from recrl.environments.rivergrid.minigrid_env import RiverGridEnv
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError
@@ -29,6 +29,7 @@ from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
 from recrl.orchestrator.trial.attempt import run_recorded
 from recrl.orchestrator.trial.saved_policy import NoCheckpointError, SavedTrial, summary
 from recrl.orchestrator.trial.videos import VideoFormat
+from tests.environments.sample_options import sample_options
 
 SPEC = TrialSpec(
     task=Choice("two-state", {"horizon": 10}),
@@ -44,7 +45,7 @@ SPEC = TrialSpec(
     seed=5,
 )
 RIVER = replace(SPEC, task=Choice("rivergrid-1a", {"horizon": 12}), num_envs=2, rollout_steps=12)
-BOTH = tuple(FrozenPolicy)
+BOTH = tuple(PolicyKind)
 
 
 def run(folder: Path, spec: TrialSpec, *, updates: int | None = None) -> TrialStore:
@@ -136,7 +137,7 @@ def test_an_evaluation_ends_although_only_some_episodes_do(
     monkeypatch.setattr(Collector, "collect", without_the_second)
     policy, seed = SavedTrial.load(complete).policy, np.random.SeedSequence(0)
     with pytest.raises(RuntimeError, match=f"no episode ended in {most} steps of environment 1"):
-        evaluate(policy, environments, FrozenPolicy.STOCHASTIC, num_episodes=8, seed=seed)
+        evaluate(policy, environments, PolicyKind.STOCHASTIC, num_episodes=8, seed=seed)
 
 
 def test_a_stopped_trial_is_looked_at_as_far_as_it_is(tmp_path: Path) -> None:
@@ -208,26 +209,26 @@ def test_a_film_is_of_the_task_that_was_learnt(crossing: TrialStore) -> None:
         film(
             saved.policy,
             make_drawn("rivergrid-1a", options=options),
-            FrozenPolicy.DETERMINISTIC,
+            PolicyKind.DETERMINISTIC,
             num_costs=1,
             seed=np.random.SeedSequence(0),
         )
     )
     environments = make_vector("rivergrid-1a", 1, options=options)
     seed = np.random.SeedSequence(0)
-    (episode,) = evaluate(saved.policy, environments, FrozenPolicy.DETERMINISTIC, num_episodes=1, seed=seed)
+    (episode,) = evaluate(saved.policy, environments, PolicyKind.DETERMINISTIC, num_episodes=1, seed=seed)
     assert [shot.step for shot in shots] == list(range(episode.length + 1))
     assert shots[-1].episode_return == pytest.approx(episode.episode_return)
     assert tuple(shots[-1].costs) == episode.costs
     assert shots[0].frame.shape == (288, 288, 3)
     drawn = make_drawn("rivergrid-1a", options=options)
-    seldom = film(saved.policy, drawn, FrozenPolicy.DETERMINISTIC, num_costs=1, seed=seed, every=5)
+    seldom = film(saved.policy, drawn, PolicyKind.DETERMINISTIC, num_costs=1, seed=seed, every=5)
     assert [shot.step for shot in seldom] == sorted({*range(0, episode.length + 1, 5), episode.length})
 
 
 def test_a_video_has_a_picture_a_step(crossing: TrialStore) -> None:
     before = contents(crossing)
-    path = SavedTrial.load(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=3)
+    path = SavedTrial.load(crossing).film(PolicyKind.STOCHASTIC, VideoFormat.GIF, seed=3)
     assert path == crossing.videos_folder / "update-00000009__seed-3__stochastic.gif"
     with Image.open(path) as video:
         assert 2 <= video.n_frames <= 13  # type: ignore[attr-defined]  # frames without a change are one
@@ -239,7 +240,7 @@ def test_a_task_without_rendering_is_a_sentence(complete: TrialStore) -> None:
     with pytest.raises(
         RecrlError, match=r"^two-state ppo-lag none seed 5: the task two-state cannot be rendered"
     ):
-        SavedTrial.load(complete).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
+        SavedTrial.load(complete).film(PolicyKind.STOCHASTIC, VideoFormat.GIF, seed=None)
 
 
 @pytest.mark.parametrize(
@@ -261,7 +262,7 @@ def test_a_task_that_does_not_render_rgb_is_a_sentence(
 ) -> None:
     monkeypatch.setattr(RiverGridEnv, "render", render)
     with pytest.raises(RecrlError) as error:
-        SavedTrial.load(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
+        SavedTrial.load(crossing).film(PolicyKind.STOCHASTIC, VideoFormat.GIF, seed=None)
     title = "rivergrid-1a ppo-lag none seed 5"
     assert str(error.value) == f"{title}: the task rivergrid-1a cannot be filmed: {reason}"
 
@@ -274,7 +275,7 @@ def test_an_error_of_a_tasks_own_rendering_is_kept(
 
     monkeypatch.setattr(RiverGridEnv, "render", render)
     with pytest.raises(RecrlError, match=r"cannot be filmed: NotImplementedError: only for people$"):
-        SavedTrial.load(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
+        SavedTrial.load(crossing).film(PolicyKind.STOCHASTIC, VideoFormat.GIF, seed=None)
 
 
 def test_a_task_with_a_wrong_frame_rate_is_a_sentence(
@@ -282,7 +283,7 @@ def test_a_task_with_a_wrong_frame_rate_is_a_sentence(
 ) -> None:
     monkeypatch.setattr(RiverGridEnv, "metadata", {**RiverGridEnv.metadata, "render_fps": "fast"})
     with pytest.raises(RecrlError, match="cannot be filmed: ValueError: could not convert string to float"):
-        SavedTrial.load(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None)
+        SavedTrial.load(crossing).film(PolicyKind.STOCHASTIC, VideoFormat.GIF, seed=None)
 
 
 def test_a_task_that_cannot_be_closed_has_its_video(
@@ -292,13 +293,13 @@ def test_a_task_that_cannot_be_closed_has_its_video(
         raise OSError("no display")
 
     monkeypatch.setattr(RiverGridEnv, "close", close)
-    assert SavedTrial.load(crossing).film(FrozenPolicy.STOCHASTIC, VideoFormat.GIF, seed=None).exists()
+    assert SavedTrial.load(crossing).film(PolicyKind.STOCHASTIC, VideoFormat.GIF, seed=None).exists()
     assert "rivergrid-1a raised an error when it was closed: OSError: no display" in caplog.text
 
 
 @pytest.mark.parametrize("name", ["rivergrid-1b", "rivergrid", "gymnasium"])
 def test_a_drawn_task_is_the_task(name: str) -> None:
-    options = TASKS[name].sample_options
+    options = sample_options(name)
     environments, drawn = make_vector(name, 1, options=options), make_drawn(name, options=options)
     first, _ = environments.reset(seed=1)
     observation, _ = drawn.reset(seed=1)
