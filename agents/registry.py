@@ -28,7 +28,7 @@ from recrl.agents.algorithms.own_options import (
     TRPOLagConfig,
 )
 from recrl.environments.cmdp import CMDPSpec
-from recrl.environments.plugins import load_attribute, resolve
+from recrl.environments.plugins import WrongKindError, load_attribute, resolve
 
 
 @dataclass(frozen=True)
@@ -105,11 +105,11 @@ def find_agent(name: str) -> AgentEntry:
 
     Raises:
         UnknownNameError: the name is not known; the message names the nearest known agent.
-        ValueError: the named object is not an AgentEntry.
+        WrongKindError: the named object is not an AgentEntry.
     """
     found = resolve(name, kind="agent", group="recrl.agents", ours=AGENTS)
     if not isinstance(found, AgentEntry):
-        raise ValueError(
+        raise WrongKindError(
             f"agent {name!r} must be an AgentEntry, got {type(found).__name__}; write MINE = "
             "recrl.agents.registry.AgentEntry('one sentence', Options, make_mine) and name MINE"
         )

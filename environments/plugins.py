@@ -33,6 +33,10 @@ class UnknownNameError(ValueError):
     """A task, agent or curriculum name that is not known."""
 
 
+class WrongKindError(ValueError):
+    """A name leads to an object of another kind, for example an agent's name to a function."""
+
+
 class UntrustedNameError(Exception):
     """An import path that is not followed, in ``refuse_import_paths``.
 

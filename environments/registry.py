@@ -20,7 +20,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict
 
 from recrl.environments.cmdp import CostLimits
-from recrl.environments.plugins import load_attribute, resolve
+from recrl.environments.plugins import WrongKindError, load_attribute, resolve
 from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 from recrl.environments.vector import CMDPVectorEnv
 from recrl.environments.velocity.task_definitions import VELOCITY_TASKS
@@ -140,13 +140,15 @@ def find_task(name: str) -> Task:
 
     Raises:
         UnknownNameError: the name is not known; the message names the nearest known task.
-        ValueError: the named object is neither a Task nor callable.
+        WrongKindError: the named object is neither a Task nor callable.
     """
     found = resolve(name, kind="task", group="recrl.tasks", ours=TASKS)
     if isinstance(found, Task):
         return found
     if not callable(found):
-        raise ValueError(f"task {name!r} must be a Task or return an environment, got {type(found).__name__}")
+        raise WrongKindError(
+            f"task {name!r} must be a Task or return an environment, got {type(found).__name__}"
+        )
     from recrl.environments.gymnasium_tasks import (  # noqa: PLC0415  # only if a task needs it
         draw_from_callable,
         keywords_of,

@@ -73,10 +73,11 @@ class SweepBusyError(RecrlError):
     """Another process is running this sweep."""
 
 
-class ProcessTerminatedError(SystemExit):
+class ProcessTerminatedError(BaseException):
     """SIGTERM ends this process, for example because its node is taken away.
 
-    It is no error of the user's code: the trial waits, and continues from its last commit.
+    It is no error of the user's code, which may raise any ``Exception`` or ``SystemExit``: the trial waits,
+    and continues from its last commit.
     """
 
 

@@ -83,7 +83,7 @@ class LaunchOutcome:
         result: of the trials.
         place: of the sweep's files.
         tracking_uri: of MLflow; None without MLflow.
-        sweep: the data frames; None if the launch was stopped or no trial is complete.
+        sweep: the data frames; None if the launch was stopped, no trial is complete, or they cannot be read.
     """
 
     result: SweepResult
@@ -133,8 +133,6 @@ def launch_grid(
         RecrlError: another process runs the sweep, or Ray, MLflow, the object store or the disk cannot be
             used.
     """
-    from recrl.analysis.data import sweep_data  # noqa: PLC0415  (imports pandas)
-
     listener = listener or LaunchListener()
     store = SweepStore(options.root, grid.name)
     place = sweep_place(store, options.storage)
@@ -156,14 +154,15 @@ def launch_grid(
 
     def finish(after: SweepProgress) -> None:
         during.close()
-        if not stop.is_set() and after.counts[DisplayStatus.COMPLETE]:
-            read.append(sweep_data.load(store))
+        if stop.is_set():
+            return
+        if after.counts[DisplayStatus.COMPLETE] and (sweep := _load(store, listener)):
+            read.append(sweep)
             if options.figures:
-                _draw(read[0], store, listener)
+                _draw(sweep, store, listener)
             elif uri:
-                _write_outcomes(read[0], store, listener)
-        if not stop.is_set():
-            _film(grid, after, store, stop, listener)
+                _write_outcomes(sweep, store, listener)
+        _film(grid, after, store, stop, listener)
 
     with contextlib.ExitStack() as during, _listening(stop, listener.stopping):
         settings = SweepRunSettings(
@@ -248,8 +247,20 @@ def _sync_to(uri: str) -> Callable[[SweepStore], RunningSync]:
     return lambda store: start_sync(store, uri, interval_seconds=SYNC_INTERVAL_SECONDS)
 
 
+def _load(store: SweepStore, listener: LaunchListener) -> Sweep | None:
+    """Read a launch's results; if that fails, report the error: MLflow must still be updated."""
+    from recrl.analysis.data import sweep_data  # noqa: PLC0415  (imports pandas)
+
+    try:
+        return sweep_data.load(store)
+    except Exception as error:
+        logger.debug("results of %s", store.name, exc_info=True)
+        listener.failed_to_draw(error)
+        return None
+
+
 def _draw(sweep: Sweep, store: SweepStore, listener: LaunchListener) -> None:
-    """Draw a launch's figures. If that fails, report the error and continue: MLflow must still be updated."""
+    """Draw a launch's figures; if that fails, report the error: MLflow must still be updated."""
     from recrl.analysis.report import drawing  # noqa: PLC0415  (imports matplotlib)
 
     listener.drawing()

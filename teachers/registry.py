@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from recrl.environments.plugins import resolve
+from recrl.environments.plugins import WrongKindError, resolve
 from recrl.teachers.algorithm_2 import Algorithm2Teacher
 from recrl.teachers.cooling import CoolingConfig, CoolingTeacher
 from recrl.teachers.dynamic import DynamicTeacher
@@ -106,11 +106,11 @@ def find_teacher(name: str) -> TeacherKind:
 
     Raises:
         UnknownNameError: the name is not known; the message names the nearest known one.
-        TypeError: the named object is not a TeacherKind.
+        WrongKindError: the named object is not a TeacherKind.
     """
     kind = resolve(name, kind="curriculum", group="recrl.teachers", ours=TEACHERS)
     if not isinstance(kind, TeacherKind):
-        raise TypeError(
+        raise WrongKindError(
             f"curriculum {name!r} must be a TeacherKind, got {type(kind).__name__}; write MINE = "
             "recrl.teachers.registry.TeacherKind('one sentence', Options, MyCurriculum) and name MINE"
         )

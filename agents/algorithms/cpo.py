@@ -20,7 +20,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from recrl.agents.algorithms.own_options import CPOConfig, PCPOConfig
+from recrl.agents.algorithms.own_options import CPOConfig
 from recrl.agents.building_blocks.advantages import standardised_advantages
 from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.constraints.violation_integral import ViolationIntegral
@@ -78,7 +78,7 @@ class ConstrainedPolicyOptimisation:
 
     def __init__(
         self,
-        config: CPOConfig | PCPOConfig,
+        config: CPOConfig,
         num_costs: int,
         solve: Callable[[StepProblem], DualSolution] = solve_dual,
     ) -> None:

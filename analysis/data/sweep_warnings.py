@@ -33,7 +33,7 @@ def damages(sweep: Sweep) -> list[str]:
 def doubts(sweep: Sweep) -> list[str]:
     """Return sentences on code, libraries and devices that differ, and on ineffective curricula."""
     installed = InstalledCode()
-    ran = [(it.status, compare(attempts(it), it.spec, installed)) for it in sweep.facts]
+    ran = [(it.status, compare(attempts_with_code(it), it.spec, installed)) for it in sweep.facts]
     other = other_code_sentence(ran)
     if other and sweep.folder is None:
         other += ", in a sweep's own folder"
@@ -107,7 +107,7 @@ def _ran_by_cell(
     """
     cells: dict[tuple[str, str, str], _Ran] = {}
     for group, trial in zip(sweep.groups, sweep.facts, strict=True):
-        if known := attempts(trial):
+        if known := attempts_with_code(trial):
             for found in of_attempts(known):
                 of_trial = {name: {str(value)} for name, value in found.items()}
                 cells[group] = _joined(cells.get(group, {}), of_trial)
@@ -175,6 +175,6 @@ def _titles(flags: pd.DataFrame, flag: str) -> list[str]:
     return [f"{it.task} {it.agent} {it.method} seed {it.seed}" for it in flags[flags[flag]].itertuples()]
 
 
-def attempts(trial: TrialFacts) -> list[dict[str, Any]]:
+def attempts_with_code(trial: TrialFacts) -> list[dict[str, Any]]:
     """Return the provenance of the attempts that recorded their code."""
     return [it for it in trial.attempts if isinstance(it.get("code"), dict)]

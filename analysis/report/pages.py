@@ -13,7 +13,7 @@ import pandas as pd
 
 from recrl.analysis.data.labels import GROUP
 from recrl.analysis.data.sweep_data import Sweep
-from recrl.analysis.data.sweep_warnings import attempts, doubts
+from recrl.analysis.data.sweep_warnings import doubts
 from recrl.analysis.report import html_page, table_formats
 from recrl.analysis.report.figure_list import KINDS, SKETCHED, Drawing, without_episodes
 from recrl.analysis.report.html_page import Section
@@ -44,9 +44,10 @@ def write_reports(
     Returns:
         The written files.
     """
+    said = [_count(sweep), *remarks(sweep)]
     return [
-        table_formats.write_text(_html(sweep, drawn, figures, tables), folder / "report.html"),
-        table_formats.write_text(_markdown(sweep, drawn, figures, tables), folder / "report.md"),
+        table_formats.write_text(_html(sweep, said, drawn, figures, tables), folder / "report.html"),
+        table_formats.write_text(_markdown(sweep, said, drawn, figures, tables), folder / "report.md"),
     ]
 
 
@@ -60,16 +61,17 @@ def shown_figures(folder: Path) -> set[str]:
     return {stem for stem in stems if stem.partition("_")[0] in KINDS}
 
 
-def _html(sweep: Sweep, drawn: list[Path], figures: Mapping[str, Drawing], tables: Tables) -> str:
+def _html(
+    sweep: Sweep, said: list[str], drawn: list[Path], figures: Mapping[str, Drawing], tables: Tables
+) -> str:
     """Return the page: answers, verdicts, warnings and the first figures; the rest is folded."""
     failed = bool(sweep.trials["status"].isin([TrialStatus.FAILED.value, TrialStatus.DAMAGED.value]).any())
-    sentences = [_count(sweep), *missing(sweep)]
     files = _full_sizes(drawn)
     first = {path: file for path, file in files.items() if figures[path.stem].kind in SKETCHED}
     further = {path: file for path, file in files.items() if path not in first}
     settings = html_page.verbatim(sweep.grid) + html_page.verbatim(_settings(sweep))
     sections = [
-        Section("Trials and warnings", html_page.items(sentences, kind="failed" if failed else "plain")),
+        Section("Trials and warnings", html_page.items(said, kind="failed" if failed else "plain")),
         Section("Figures", _figures(first, figures)),
         *([Section("More figures", _figures(further, figures), folded=True)] if further else []),
         *(
@@ -97,7 +99,7 @@ def _figures(files: Mapping[Path, str], figures: Mapping[str, Drawing]) -> str:
 def _made(sweep: Sweep) -> str:
     """Return the versions of recrl that made the trials, and the date of the last policy update."""
     versions = sorted(
-        {str(attempt["recrl"]) for it in sweep.facts for attempt in attempts(it) if "recrl" in attempt}
+        {str(attempt["recrl"]) for it in sweep.facts for attempt in it.attempts if "recrl" in attempt}
     )
     made = [f"recrl {' and '.join(versions)}"] if versions else []
     if "time" in sweep.updates and len(sweep.updates):  # an export has no times
@@ -136,7 +138,9 @@ def _provenance(sweep: Sweep) -> list[str]:
     return [f"{counted(count, 'trial')}:\n{text}" for text, count in sorted(origins.items())]
 
 
-def _markdown(sweep: Sweep, drawn: list[Path], figures: Mapping[str, Drawing], tables: Tables) -> str:
+def _markdown(
+    sweep: Sweep, said: list[str], drawn: list[Path], figures: Mapping[str, Drawing], tables: Tables
+) -> str:
     """Return the report as text: answers, verdicts, warnings, figures, tables, provenance."""
     judged = tables.verdicts
     lines = [f"# {table_formats.markdown_text(sweep.name)}", ""]
@@ -147,7 +151,7 @@ def _markdown(sweep: Sweep, drawn: list[Path], figures: Mapping[str, Drawing], t
         lines += _list(explanation(judged))
     else:
         lines.append(no_verdict(sweep))
-    lines += ["", "## Trials and warnings", "", _count(sweep), "", *_list(missing(sweep))]
+    lines += ["", "## Trials and warnings", "", said[0], "", *_list(said[1:])]
     lines += ["", "## Figures", ""]
     for path in _full_sizes(drawn):
         caption = table_formats.markdown_text(figures[path.stem].caption)
@@ -170,8 +174,8 @@ def _marked(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(verdict=texts)
 
 
-def missing(sweep: Sweep) -> list[str]:
-    """Return sentences on incomplete results; empty for a complete sweep."""
+def remarks(sweep: Sweep) -> list[str]:
+    """Return sentences on incomplete and doubtful results; empty for a complete sweep without doubts."""
     sentences = [*sweep.notes, *doubts(sweep)]
     for agent in without_episodes(sweep):
         sentences.append(f"{agent}: no episode has finished, so there are no learning curves")

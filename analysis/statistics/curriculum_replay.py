@@ -12,6 +12,7 @@ curriculum's window or tolerance.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from recrl.orchestrator.errors import RecrlError
 from recrl.orchestrator.files.trial_reader import TrialReader
 from recrl.orchestrator.spec import Choice
 from recrl.teachers.registry import make_teacher
-from recrl.teachers.teacher import AnswerCheck, ProgressReport, TeacherSpec
+from recrl.teachers.teacher import AnswerCheck, ProgressReport
 
 
 def replay(trial: TrialReader, method: Choice) -> pd.DataFrame:
@@ -45,9 +46,7 @@ def replay(trial: TrialReader, method: Choice) -> pd.DataFrame:
     if not len(updates):
         raise RecrlError(f"{trial.spec.title}: cannot be replayed, because it has no policy update yet")
     spec = trial.spec
-    teacher = make_teacher(
-        TeacherSpec(method.name, method.options, spec.train_limits, spec.deploy_limits, spec.train_steps)
-    )
+    teacher = make_teacher(replace(spec, method=method).teacher)
     costs = range(len(spec.deploy_limits))
     names = [f"cost {i}" for i in costs]
     check = AnswerCheck(method.label, names, spec.train_limits, spec.deploy_limits)

@@ -55,17 +55,17 @@ class Course(NamedTuple):
     velocities: Floats
 
 
-def leads(timestep: float, first_substep: Floats) -> Floats:
+def leads(timestep: float, first_substep: int) -> Floats:
     """Return the target of gremlins in each physics step: 0.35 (sin t, cos t) at a height of 0.2 m.
 
     Args:
         timestep: seconds in one physics step.
-        first_substep: physics steps since the episode began, [B].
+        first_substep: physics steps since the episode began.
 
     Returns:
-        offsets from the centre of the circle, metres, [B, SUBSTEPS, 3]; the height is absolute.
+        offsets from the centre of the circle, metres, [SUBSTEPS, 3]; the height is absolute.
     """
-    time = timestep * (first_substep[:, None] + np.arange(SUBSTEPS))
+    time = timestep * (first_substep + np.arange(SUBSTEPS))
     return np.stack(
         (
             GREMLIN_TRAVEL * np.sin(time),
@@ -85,7 +85,7 @@ def gremlin_course(task: SafetyTask) -> Course:
     positions, velocities = np.empty((HORIZON + 1, 3)), np.empty((HORIZON + 1, 6))
     positions[0], velocities[0] = data.qpos[:3], data.qvel
     for step in range(HORIZON):
-        for lead in leads(task.timestep, np.array([step * SUBSTEPS]))[0]:
+        for lead in leads(task.timestep, step * SUBSTEPS):
             data.mocap_pos[0] = lead
             mujoco.mj_step(model, data)
         positions[step + 1], velocities[step + 1] = data.qpos[:3], data.qvel

@@ -148,7 +148,7 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
         self.steps[ids] = 0
         self.button_timer[ids] = 0
         self.embodied[ids] = NOT_YET
-        self._renew_goals(ids)
+        self._renew_goals(ids)  # where there is no room for another one, that of the layout stays
 
     def set_actions(self, actions: npt.NDArray[Any]) -> bool:
         """Set the actions of the next step, [B, 2]; return False if one is not a number within [-1, 1]."""
@@ -290,7 +290,7 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
         for kind, mocap in (("buttons", scene.button_mocap), ("pillars", scene.pillar_mocap)):
             self.mocap_pos[index, list(mocap), :2] = layout[kind]
         for kind, places in self.group.items():
-            if kind != "goal":
+            if len(layout[kind]):  # in Button no goal is placed: it is one of the buttons
                 self.points[index, places] = layout[kind]
         self.circles[index] = layout["gremlins"]
         self.gremlin_yaws[index] = generator.uniform(0.0, 2.0 * np.pi, task.gremlins.number)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from collections.abc import Callable
 
 from rich.console import Console
 
@@ -34,6 +35,8 @@ from recrl.orchestrator.trial_warnings import (
     landed_hard,
     no_curriculum_sentence,
 )
+
+REPEAT_SECONDS = 5.0  # between two requests to stop the same launch
 
 
 def run_status(request: StatusRequest, console: Console) -> ExitCode:
@@ -120,11 +123,21 @@ def run_stop(request: StopRequest, console: Console) -> ExitCode:
         say(console, f"{store.name}: no launch runs this sweep")
         return ExitCode.OK
     say(console, f"{store.name}: its trials save their state")
-    while still_runs():
-        time.sleep(REQUEST_SECONDS)
+    while _runs_for(REPEAT_SECONDS, still_runs):
+        place.request_stop()  # a launch that has just begun deletes earlier requests
     place.refresh()
     say(console, f"{store.name}: {display.status_sentence(progress(store.specs(), store))}")
     return ExitCode.OK
+
+
+def _runs_for(seconds: float, still_runs: Callable[[], bool]) -> bool:
+    """Wait for the end of a launch for some time; return whether it runs after that."""
+    end = time.monotonic() + seconds
+    while running := still_runs():
+        if time.monotonic() >= end:
+            break
+        time.sleep(REQUEST_SECONDS)
+    return running
 
 
 def run_logs(request: LogsRequest, console: Console) -> ExitCode:

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import PydanticUndefined
 
 from recrl.agents.registry import AGENTS, find_agent
-from recrl.environments.plugins import UnknownNameError, nearest
+from recrl.environments.plugins import UnknownNameError, WrongKindError, nearest
 from recrl.environments.registry import TASKS, find_task, options_model
 from recrl.orchestrator.errors import USERS_ERRORS, RecrlError, described
 from recrl.orchestrator.grid.file_models import (
@@ -152,7 +152,7 @@ def _kind_of_path(path: str) -> Kind:
             KINDS[plural].model(path)
         except UnknownNameError as error:
             raise RecrlError(str(error)) from error
-        except (TypeError, ValueError) as error:
+        except WrongKindError as error:
             reason = error
         else:
             return KINDS[plural]

@@ -31,6 +31,7 @@ from recrl.environments.cmdp import CMDPSpec, CostLimits
 from recrl.environments.plugins import (
     UnknownNameError,
     UntrustedNameError,
+    WrongKindError,
     nearest,
     trusted_attribute,
 )
@@ -270,7 +271,7 @@ class _Check:
         except ValidationError as error:
             for inner, sentence in sentences(error, _model_of(entry.name, options_of)):
                 self.problems.add((*place, "options", *inner), sentence)
-        except UnknownNameError as error:
+        except (UnknownNameError, WrongKindError) as error:
             self.problems.add(name_place, str(error))
         except UntrustedNameError as error:
             self.uncalled.append(f"{'.'.join(map(str, place))} ({error.path})")

@@ -83,11 +83,13 @@ def _read_seeds(value: Any) -> tuple[int, ...]:
         return tuple(range(value))
     if not isinstance(value, list) or not 1 <= len(value) <= MAX_SEEDS:
         raise ValueError(f"must be a number of seeds or a list of seeds, got {as_written(value)}")
-    for index, seed in enumerate(value):
+    seen: set[int] = set()
+    for seed in value:
         if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
             raise ValueError(f"must be whole numbers from 0 to 2^63 - 1, got {as_written(seed)}")
-        if seed in value[:index]:
+        if seed in seen:
             raise ValueError(f"must differ, got {seed} twice")
+        seen.add(seed)
     return tuple(value)
 
 

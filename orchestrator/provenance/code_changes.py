@@ -28,8 +28,8 @@ from recrl.environments.registry import TASKS
 from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.provenance.own_package import digest_of_code, folder_of
-from recrl.orchestrator.provenance.project_files import OURS, files_of, files_with_imports, folder_of_files
-from recrl.orchestrator.provenance.versions import LIBRARIES, package_versions
+from recrl.orchestrator.provenance.project_files import files_of, files_with_imports, folder_of_files
+from recrl.orchestrator.provenance.versions import DISTRIBUTION, LIBRARIES, package_versions
 from recrl.orchestrator.spec import TrialSpec
 from recrl.teachers.registry import TEACHERS
 
@@ -76,7 +76,7 @@ class InstalledCode:
         These are the named ones, and those of the same project that they import. A package that is not
         installed here is left out.
         """
-        found = {OURS: _own_digest()}
+        found = {DISTRIBUTION: _own_digest()}
         for kind, group, ours in KINDS:
             choice = getattr(spec, kind)
             names = [] if choice.name in ours else [self._module_of(choice.name, group)]

@@ -11,8 +11,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from recrl.orchestrator.provenance.source_text import without_documentation
+from recrl.orchestrator.provenance.versions import DISTRIBUTION
 
-DISTRIBUTION = "recrl"
 FOLDERS = ("agents", "analysis", "environments", "orchestrator", "teachers")
 METADATA = ("METADATA", "PKG-INFO", "entry_points.txt")  # an editable install has one of the first two
 

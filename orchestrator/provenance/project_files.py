@@ -19,8 +19,8 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 from recrl.environments.plugins import modules_folder
+from recrl.orchestrator.provenance.versions import DISTRIBUTION
 
-OURS = "recrl"
 MOST_FILES = 1000  # of the user's project, for one plug-in
 PROJECT_FILES = ("pyproject.toml", "setup.py", "setup.cfg", ".git")  # in the folder of a project
 INSTALLED = ("site-packages", "dist-packages")
@@ -41,7 +41,7 @@ def files_with_imports(package: str) -> dict[str, dict[str, Path]]:
     waiting = sorted(_imported_by(files)) if project else []
     while waiting and room > 0:
         name = waiting.pop(0)
-        if name in found or name == OURS or name in sys.stdlib_module_names:
+        if name in found or name == DISTRIBUTION or name in sys.stdlib_module_names:
             continue
         files = files_of(name, project)
         if not files:

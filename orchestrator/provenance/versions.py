@@ -39,7 +39,7 @@ def collect(folder: Path | None = None) -> dict[str, Any]:
     """
     return {
         "recrl": recrl_version(),
-        "project": git_state((folder or Path.cwd()).resolve()),
+        "project": _git_state_of_project(folder),
         "source": git_state(Path(__file__).resolve().parent),
         "python": platform.python_version(),
         "system": platform.platform(),
@@ -48,6 +48,13 @@ def collect(folder: Path | None = None) -> dict[str, Any]:
         "cpu_count": os.cpu_count(),
         "packages": package_versions(_dependencies()),
     }
+
+
+def _git_state_of_project(folder: Path | None) -> dict[str, Any] | None:
+    try:
+        return git_state((folder or Path.cwd()).resolve())
+    except FileNotFoundError:  # the working directory was deleted
+        return None
 
 
 @functools.lru_cache(maxsize=16)

@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import logging
 import signal
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -35,8 +36,6 @@ class TuneTrial(tune.Trainable):
 
     def setup(self, config: dict[str, Any]) -> None:
         """Prepare for the first trial."""
-        if ray.is_initialized() and ray.get_runtime_context().get_actor_id() is not None:
-            signal.signal(signal.SIGTERM, _end_process)  # Ray's own handler raises a plain SystemExit
         self._take(config)
 
     def reset_config(self, new_config: dict[str, Any]) -> bool:
@@ -50,12 +49,16 @@ class TuneTrial(tune.Trainable):
         Raises:
             TeacherUnavailableError: the teacher does not answer; Tune tries the trial again.
             StorageError: the object store was down for too long; Tune tries the trial again.
+            SystemExit: the process got SIGTERM; the trial waits, and Tune tries it again.
         """
         from recrl.orchestrator.trial.attempt import run_recorded  # noqa: PLC0415  (imports torch; the driver does without)
 
         if not self._stop_signal.is_set():
             try:
-                with self._place.working_copy(self._spec, self._stop_signal.is_set) as trial:
+                with (
+                    _noticing_sigterm(),
+                    self._place.working_copy(self._spec, self._stop_signal.is_set) as trial,
+                ):
                     run_recorded(
                         self._spec,
                         trial,
@@ -78,9 +81,23 @@ class TuneTrial(tune.Trainable):
         self._teacher = RayTeacher(self._spec.teacher, find_teacher_service(name)) if name else None
 
 
-def _end_process(number: int, frame: FrameType | None) -> None:
-    """End this worker process; its trial waits to be resumed."""
-    raise ProcessTerminatedError(1)
+@contextmanager
+def _noticing_sigterm() -> Iterator[None]:
+    """Raise ProcessTerminatedError in the body on SIGTERM, and SystemExit after it, which Ray expects.
+
+    Ray's own handler raises SystemExit at once, but a user's code may raise that as well.
+    """
+
+    def end_process(number: int, frame: FrameType | None) -> None:
+        raise ProcessTerminatedError
+
+    before = signal.signal(signal.SIGTERM, end_process)
+    try:
+        yield
+    except ProcessTerminatedError:
+        raise SystemExit(1) from None
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def spec_of(trial: Any) -> TrialSpec:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from recrl.orchestrator.background_thread import background_thread
-from recrl.orchestrator.errors import LostLeaseError, StorageError
+from recrl.orchestrator.errors import LostLeaseError, ProcessTerminatedError, StorageError
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.trial_files import FileKind, files_of
@@ -231,6 +231,9 @@ def working_copy(
         try:
             with background_thread(partial(_follow, upload), name="upload"):
                 yield trial
+        except ProcessTerminatedError:  # there is little time
+            _finish(upload, lambda: True)
+            raise
         except Exception:  # but not a KeyboardInterrupt, which ends at once
             _finish(upload, should_stop)
             raise

@@ -9,10 +9,12 @@ from __future__ import annotations
 import argparse
 import os
 import select
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,7 +33,11 @@ ORPHAN_SECONDS = 15.0  # trials outlive a killed launch by some seconds; the las
 
 @dataclass
 class BackgroundSync:
-    """The process that keeps MLflow up to date during a launch; it ends when its parent does."""
+    """The process that keeps MLflow up to date during a launch; it ends when its parent does.
+
+    Attributes:
+        process: the leader of its own process group.
+    """
 
     process: subprocess.Popen[bytes]
 
@@ -49,7 +55,8 @@ class BackgroundSync:
         try:
             return self.process.wait(timeout) == 0
         except subprocess.TimeoutExpired:
-            self.process.kill()
+            with suppress(ProcessLookupError):
+                os.killpg(self.process.pid, signal.SIGKILL)  # with the process that writes the export file
             self.process.wait()
             return False
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.tracking.chart_view import charts_page
-from recrl.orchestrator.tracking.client import is_server
+from recrl.orchestrator.tracking.client import MLFLOW_SETTINGS, is_server
 from recrl.orchestrator.tracking.mlflow_sync import last_report, sync
 from recrl.orchestrator.tracking.positions import sync_folder
 
 # Without the job runner of MLflow's language-model features a server takes 0.5 GB of memory and not 2.5.
-SETTINGS = ("DO_NOT_TRACK=true", "MLFLOW_DISABLE_TELEMETRY=true", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false")
+SERVER_SETTINGS = ("DO_NOT_TRACK", "MLFLOW_DISABLE_TELEMETRY", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION")
 
 START_SECONDS = 120.0  # until the server must answer
 
@@ -31,7 +31,8 @@ def ui_command(store: SweepStore, uri: str, *, port: int = 5000) -> list[str]:
     ):  # otherwise it is an environment variable, which other users cannot see
         stores += ["--backend-store-uri", uri]
     address = ["--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
-    return ["env", *SETTINGS, sys.executable, "-m", "mlflow", "server", *stores, *address]
+    settings = [f"{name}={os.environ.get(name, MLFLOW_SETTINGS[name])}" for name in SERVER_SETTINGS]
+    return ["env", *settings, sys.executable, "-m", "mlflow", "server", *stores, *address]
 
 
 def ui_url(store: SweepStore, uri: str, *, port: int = 5000) -> str:

@@ -146,8 +146,8 @@ def run_recorded(
 ) -> TrialStatus:
     """Call ``run_trial``, and record the run in the trial's folder.
 
-    A trial that raises is FAILED in its own files, with the traceback in ``error.txt``. Nothing is raised
-    here, so that a failure does not stop other trials. With a full disk the trial waits instead, and the same
+    A trial that raises is FAILED in its own files, with the traceback in ``error.txt``. Its error is not
+    raised here, so that it does not stop other trials. With a full disk the trial waits instead, and the same
     launch continues from its last commit once there is room.
 
     Args:
@@ -163,7 +163,7 @@ def run_recorded(
 
     Raises:
         TeacherUnavailableError: the teacher does not answer; the trial waits to be resumed.
-        ProcessTerminatedError: the process got SIGTERM; likewise.
+        ProcessTerminatedError: the process got SIGTERM, and ``should_stop`` is false; likewise.
     """
     provenance = {
         **collect_provenance(),
@@ -194,13 +194,13 @@ def run_recorded(
         except StorageError as error:
             logger.error("%s", error)
             return _close(writer, TrialStatus.WAITING, error=str(error))
+        except ProcessTerminatedError:
+            logger.warning("the process got SIGTERM; the trial waits to be resumed")
+            status = _close(writer, TrialStatus.WAITING)
+            if should_stop():  # a second signal to a stopping worker
+                return status
+            raise
         except USERS_ERRORS as error:
-            if isinstance(error, SystemExit) and should_stop():  # a second signal to a stopping worker
-                return _close(writer, TrialStatus.WAITING)
-            if isinstance(error, ProcessTerminatedError):
-                logger.warning("the process got SIGTERM; the trial waits to be resumed")
-                _close(writer, TrialStatus.WAITING)
-                raise
             logger.exception("failed; rows and checkpoint end at the last commit")
             notes = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
             text = shown(f"{described(error)}{notes}")

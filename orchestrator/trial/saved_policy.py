@@ -31,6 +31,7 @@ from recrl.orchestrator.files.atomic_files import write_atomically
 from recrl.orchestrator.files.row_files import rows_text
 from recrl.orchestrator.files.trial_files import of_update
 from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.number_texts import with_error
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.trial import TrialSeeds, evaluation_rows, open_environments
 from recrl.orchestrator.trial.videos import VideoFormat, captioned, stride, write_video
@@ -257,6 +258,5 @@ def summary(rows: pd.DataFrame, saved: SavedTrial) -> list[dict[str, Any]]:
 def _mean_text(column: pd.Series[float]) -> str:
     """Format the mean and its standard error, ``9.50 ± 0.02``; the mean alone for a single value."""
     values = column.to_numpy(np.float64)
-    if len(values) < 2:
-        return f"{values.mean():.2f}"
-    return f"{values.mean():.2f} ± {values.std(ddof=1) / np.sqrt(len(values)):.2f}"
+    error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
+    return with_error(float(values.mean()), float(error))

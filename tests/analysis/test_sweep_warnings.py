@@ -41,7 +41,7 @@ def test_seeds_of_a_cell_that_ran_different_code_are_one_sentence(finished: Swee
     )
     assert mixed_code_sentence(sweep) == sentence
     assert doubts(sweep)[1:] == [sentence]  # after that on code which is not installed
-    assert sentence in pages.missing(sweep)
+    assert sentence in pages.remarks(sweep)
 
 
 def test_an_export_is_advised_what_only_its_folder_can_do(finished: Sweep) -> None:
@@ -89,7 +89,7 @@ def test_versions_of_libraries_that_differ_between_seeds_are_one_sentence(finish
         "versions of libraries differ between seeds that are averaged (river-a cpo linear), so a difference "
         "may come from them: torch 2.12.0, 2.13.0"
     )
-    assert mixed_versions_sentence(sweep) in pages.missing(sweep)
+    assert mixed_versions_sentence(sweep) in pages.remarks(sweep)
 
 
 def test_a_curriculum_that_ran_with_other_versions_than_none_is_named(finished: Sweep) -> None:
@@ -114,7 +114,7 @@ def test_seeds_that_learnt_on_other_devices_are_one_sentence(finished: Sweep) ->
         "devices differ between seeds that are averaged (river-a cpo linear), so a difference may come from "
         "them: learnt on cpu, cuda: H200"
     )
-    assert mixed_devices_sentence(sweep) in pages.missing(sweep)
+    assert mixed_devices_sentence(sweep) in pages.remarks(sweep)
 
 
 @pytest.mark.parametrize("packages", [None, [], "text"])

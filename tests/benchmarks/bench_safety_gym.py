@@ -101,7 +101,7 @@ class Led(Bare):
     def steps(self) -> None:
         """Take some environment steps under random controls."""
         for controls in self.generator.uniform(-1.0, 1.0, (STEPS, len(self.datas), 2)):
-            course = leads(self.model.opt.timestep, np.array([float(self.substeps)]))[0]
+            course = leads(self.model.opt.timestep, self.substeps)
             self.substeps += SUBSTEPS
             course[:, 1] += PARKED
             for data, control in zip(self.datas, controls, strict=True):

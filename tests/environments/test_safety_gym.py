@@ -13,6 +13,7 @@ import numpy.typing as npt
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from recrl.environments.safety_gym.layout import keepouts
 from recrl.environments.safety_gym.safety_gym_environments import (
     SafetyGymEnv,
     SafetyGymOptions,
@@ -280,6 +281,20 @@ def test_an_episode_ends_when_there_is_no_room_for_a_goal(monkeypatch: pytest.Mo
         *_, terminated, truncated, info = environment.step(drive(environment))
     assert info["goal_met"]
     assert not truncated
+
+
+def test_an_episode_without_room_for_another_goal_begins_with_that_of_its_layout(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    environment = SafetyGymVectorEnv("CarGoal2", 20)
+    environment.reset(seed=0)
+    monkeypatch.setattr("recrl.environments.safety_gym.safety_gym_batch.sample_goal", lambda *_: None)
+    environment.reset(seed=1)
+    batch = environment.batch
+    goals = batch.points[:, batch.group["goal"].start]
+    for kind in ("hazards", "vases"):
+        apart = np.linalg.norm(batch.points[:, batch.group[kind]] - goals[:, None], axis=-1)
+        assert apart.min() >= sum(keepouts(batch.task)[it][1] for it in (kind, "goal"))
 
 
 def test_an_unknown_task_or_option_is_refused() -> None:

@@ -10,16 +10,17 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pandas as pd
 import pytest
 
-from recrl.analysis.data import export
+from recrl.analysis.data import export, sweep_data
 from recrl.analysis.figures import learning_curves
 from recrl.environments.plugins import load_attribute
 from recrl.orchestrator.cli import display, status
@@ -27,13 +28,14 @@ from recrl.orchestrator.cli.argument_fields import Request
 from recrl.orchestrator.cli.arguments import COMMANDS, parse
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.cli.sweeps import command_line
-from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.errors import DamagedError, RecrlError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.find_sweep import find_sweep
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.spec import Choice, TrialStatus
+from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.trial import speed
 from recrl.orchestrator.trial.saved_policy import SavedTrial
 from recrl.orchestrator.trial.speed import measured_speed
@@ -243,6 +245,17 @@ def test_a_full_disk_while_figures_are_drawn_ends_no_launch(
         "           to draw them later: recrl-sweep figures small --root elsewhere\n"
         "Results    elsewhere/small\n"
     ) in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_results_that_cannot_be_read_at_the_end_end_no_launch(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sweep_data, "load", Mock(side_effect=DamagedError("spec.json: is cut off")))
+    assert main(["launch", "grid.yaml", *INLINE[:-1]]) == ExitCode.OK
+    said = capsys.readouterr().out
+    assert "Figures    not all are drawn (DamagedError: spec.json: is cut off)\n" in said
+    assert "Results    runs/small\n" in said
 
 
 def test_only_some_trials(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -455,6 +468,23 @@ def test_stop_ends_a_launch_from_another_terminal(folder: Path, capsys: pytest.C
     assert main(["stop", "small"]) == ExitCode.OK
     assert capsys.readouterr().out == "small: no launch runs this sweep\n"
     assert not SweepStore(folder / "runs", "small").stop_request_path.exists()
+
+
+def test_a_stop_request_that_a_new_launch_deleted_is_repeated(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    requests: list[SweepPlace] = []
+
+    def request_stop(place: SweepPlace) -> Callable[[], bool]:
+        requests.append(place)
+        return lambda: len(requests) < 3
+
+    monkeypatch.setattr(SweepPlace, "request_stop", request_stop)
+    monkeypatch.setattr("recrl.orchestrator.cli.status.REPEAT_SECONDS", 0.0)
+    assert main(["stop", "small"]) == ExitCode.OK
+    assert len(requests) == 3
+    assert "small: its trials save their state\n" in capsys.readouterr().out
 
 
 def test_logs_are_found_by_id_title_or_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

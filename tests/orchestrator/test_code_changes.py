@@ -123,7 +123,7 @@ def test_a_changed_task_is_said_everywhere_and_run_again_when_asked(
     assert main(["evaluate", "small", "--policy", "stochastic", "--trust"]) == ExitCode.OK
     printed = capsys.readouterr().out.splitlines()
     assert {SENTENCE, INSTALLED} <= set(printed)
-    assert SENTENCE.removeprefix("warning: ") in pages.missing(sweep_data.load(store))
+    assert SENTENCE.removeprefix("warning: ") in pages.remarks(sweep_data.load(store))
 
     assert main(["launch", "grid.yaml", *INLINE, "--rerun-changed"]) == ExitCode.OK
     assert "small: 2 trials: 1 to run again on the present code, 1 complete\n" in capsys.readouterr().out
@@ -449,7 +449,7 @@ def test_of_a_package_that_is_not_here_it_is_said_that_it_was_not_compared(
     for command in (["status", "--brief"], ["figures"]):
         assert main(command) == ExitCode.OK
         assert f"warning: {sentence}" in capsys.readouterr().out.splitlines()
-    assert sentence in pages.missing(sweep_data.load(store))
+    assert sentence in pages.remarks(sweep_data.load(store))
 
 
 @pytest.mark.usefixtures("unrendered")
@@ -547,7 +547,7 @@ def test_a_curriculum_that_is_none_is_an_event_and_a_warning(
         "linear seed 0, two-state ppo-lag dynamic seed 0; give a finite train_limits above d_d"
     )
     assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"
-    assert sentence in pages.missing(sweep_data.load(store))
+    assert sentence in pages.remarks(sweep_data.load(store))
     assert json.loads(store.trials()[0].provenance_path.read_text())["attempts"][0]["attempt"] == 1
 
 
@@ -571,7 +571,7 @@ def test_a_hard_landing_is_a_warning_unless_the_curriculum_is_a_control(
     assert capsys.readouterr().out.splitlines()[-1] == f"warning: {sentence}"
     assert f"warning: {sentence}" in launched
     sweep = sweep_data.load(SweepStore(folder / "runs", "small"))
-    assert sentence in pages.missing(sweep)
+    assert sentence in pages.remarks(sweep)
     flags = curriculum_flags(sweep)
     assert flags["hard_landing"].tolist() == [method == "dynamic" for method in flags["method"]]
     assert not flags["no_curriculum"].any()

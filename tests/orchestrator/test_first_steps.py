@@ -187,6 +187,13 @@ def test_options_of_nobody_and_of_a_stranger(
     assert capsys.readouterr().err.startswith(f"recrl-sweep: {sentence}")
 
 
+def test_options_of_a_module_with_an_error_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("broken.py").write_text("raise ValueError('no such map')\n")
+    assert main(["options", "broken:TASK", "--trust"]) == ExitCode.WRONG_INPUT
+    sentence = "recrl-sweep: broken:TASK cannot be used: ValueError: no such map\n"
+    assert capsys.readouterr().err == sentence
+
+
 def test_options_of_a_task_of_ones_own_are_shown_to_who_trusts_it(capsys: pytest.CaptureFixture[str]) -> None:
     output(capsys, "init", "--template", "own-task")
     out = output(capsys, "options", "my_task:make", "--trust")

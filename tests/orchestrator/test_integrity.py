@@ -132,7 +132,7 @@ def test_a_complete_trial_that_was_cut_is_damaged_and_its_numbers_are_not_used(
     assert sweep.trials["status"].tolist() == ["complete", "damaged"]
     assert set(sweep.phases["method"]) == set(sweep.updates["method"]) == {"none"}
     title = trial.spec.title
-    assert f"{title}: damaged, 0% of its steps done: {sentence}" in pages.missing(sweep)
+    assert f"{title}: damaged, 0% of its steps done: {sentence}" in pages.remarks(sweep)
     for command in (["status", "--brief"], ["plan", "grid.yaml"], ["export", "small"]):
         assert main(command) == ExitCode.OK
         assert f"damaged: {title}: {sentence}\n" in capsys.readouterr().out

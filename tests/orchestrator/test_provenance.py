@@ -59,6 +59,15 @@ def test_outside_a_repository_there_is_no_commit(tmp_path: Path) -> None:
     assert collect(tmp_path)["project"] is None
 
 
+def test_in_a_deleted_working_directory_there_is_no_commit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "deleted").mkdir()
+    monkeypatch.chdir(tmp_path / "deleted")
+    (tmp_path / "deleted").rmdir()
+    assert collect()["project"] is None
+
+
 def test_without_git_there_is_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _repository(tmp_path)
     monkeypatch.setenv("PATH", "")

@@ -21,7 +21,13 @@ import pytest
 import recrl
 from recrl.analysis.data import export
 from recrl.orchestrator.cli.main import main
-from recrl.orchestrator.errors import LostLeaseError, RecrlError, StorageError, SweepBusyError
+from recrl.orchestrator.errors import (
+    LostLeaseError,
+    ProcessTerminatedError,
+    RecrlError,
+    StorageError,
+    SweepBusyError,
+)
 from recrl.orchestrator.executors import InlineExecutor
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -40,6 +46,7 @@ from recrl.orchestrator.run_sweep import SweepResult, SweepRunSettings, run_swee
 from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.sweep_place import SweepPlace
 from recrl.orchestrator.trial.attempt import run_recorded
+from recrl.orchestrator.trial.trial import Trial
 from tests.faults.unreliable import Unreliable
 from tests.orchestrator.launches import INLINE
 
@@ -206,6 +213,29 @@ def test_a_trial_stopped_again_and_again_on_other_machines_equals_itself(
     seen.storage.pull()
     assert seen.store.trial(spec).record().attempt == 4
     assert_equal_trial(seen.store.trial(spec), local.trial(spec))
+
+
+def test_a_worker_that_gets_sigterm_sends_its_last_commit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = grid().trials()[0]
+    advance, updates = Trial.advance, iter(range(3))
+
+    def interrupted(trial: Trial) -> None:
+        if next(updates, None) is None:
+            raise ProcessTerminatedError
+        advance(trial)
+
+    monkeypatch.setattr(Trial, "advance", interrupted)
+    with (
+        pytest.raises(ProcessTerminatedError),
+        machine(tmp_path, "ended").storage.working_copy(spec, never) as trial,
+    ):
+        run_recorded(spec, trial, should_stop=never, commit_seconds=0.0)
+    seen = machine(tmp_path, "seen")
+    seen.storage.pull(checkpoints=True)
+    there = seen.store.trial(spec)
+    assert (there.record().status, there.saved_update) == (TrialStatus.WAITING, 3)
 
 
 def test_a_trial_killed_on_one_machine_goes_on_on_another(tmp_path: Path, local: SweepStore) -> None:

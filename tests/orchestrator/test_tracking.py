@@ -33,7 +33,7 @@ from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.process_scope import process_scope
 from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.tracking import background_sync, client, mlflow_sync
-from recrl.orchestrator.tracking.background_sync import start_sync
+from recrl.orchestrator.tracking.background_sync import BackgroundSync, start_sync
 from recrl.orchestrator.tracking.chart_view import view_tag
 from recrl.orchestrator.tracking.client import sqlite_path, tracking_uri
 from recrl.orchestrator.tracking.final_outcomes import (
@@ -54,6 +54,7 @@ from recrl.orchestrator.tracking.run_content import (
 )
 from recrl.orchestrator.tracking.run_status import trial_run_status
 from recrl.orchestrator.tracking.ui import open_ui, ui_command, ui_url
+from tests.faults.chaos import comm
 from tests.faults.committing import commit_file
 
 if TYPE_CHECKING:
@@ -1066,6 +1067,18 @@ def test_a_killed_sync_leaves_nothing_lost_and_nothing_twice(write: Callable[...
         assert len(shown[trial.spec.title]["points"]["agent/kl"]) == 40
     sync(store, uri, rebuild=True)
     assert everything(store) == shown
+
+
+def test_a_killed_sync_takes_its_children_along(tmp_path: Path) -> None:
+    program = "import subprocess as s; c = s.Popen(['sleep', '60']); print(c.pid, flush=True); c.wait()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, start_new_session=True
+    )
+    assert process.stdout is not None
+    with process.stdout:
+        child = int(process.stdout.readline())
+    assert not BackgroundSync(process).stop(timeout=0.0)
+    wait_until(lambda: not comm(child))
 
 
 def test_a_sync_that_is_stopped_shows_everything_first(write: Callable[..., SweepStore]) -> None:

@@ -458,19 +458,24 @@ def test_a_stopping_worker_that_is_ended_by_a_second_signal_waits(
 
     def advance(_: Trial) -> None:
         stopping.append(True)
-        raise SystemExit(1)  # as Ray's handler of SIGTERM does
+        raise ProcessTerminatedError
 
     monkeypatch.setattr(Trial, "advance", advance)
     store = SweepStore(tmp_path, "sweep").trial(SPEC)
     assert run_recorded(SPEC, store, should_stop=lambda: bool(stopping)) is TrialStatus.WAITING
 
 
+@pytest.mark.parametrize(
+    "interrupted",
+    ["recrl.orchestrator.trial.trial.Trial.advance", "recrl.environments.plugins.import_module"],
+    ids=["training", "importing the task"],
+)
 def test_a_process_that_gets_sigterm_leaves_its_trial_waiting(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: TrialStore
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: TrialStore, interrupted: str
 ) -> None:
     store = SweepStore(tmp_path, "sweep").trial(SPEC)
     with monkeypatch.context() as ended:
-        ended.setattr(Trial, "advance", Mock(side_effect=ProcessTerminatedError(1)))
+        ended.setattr(interrupted, Mock(side_effect=ProcessTerminatedError))
         with pytest.raises(ProcessTerminatedError):
             run_recorded(SPEC, store, should_stop=never)
     record = store.record()

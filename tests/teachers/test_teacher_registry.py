@@ -13,7 +13,7 @@ import pytest
 from pydantic import ValidationError
 
 from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Phase
-from recrl.environments.plugins import UnknownNameError
+from recrl.environments.plugins import UnknownNameError, WrongKindError
 from recrl.teachers.dynamic_options import PAPER, DynamicConfig
 from recrl.teachers.registry import TEACHERS, TeacherKind, find_teacher, make_teacher, teacher_config
 from recrl.teachers.static import NoConfig, step_teacher
@@ -92,7 +92,7 @@ def test_an_import_path_leads_to_a_teacher(monkeypatch: pytest.MonkeyPatch) -> N
     step, _ = make_teacher(spec("somebodys_package:mine")).start()
     assert step.limits == CostLimits((50.0,))
     with pytest.raises(
-        TypeError, match=r"'somebodys_package:broken' must be a TeacherKind, got function; write MINE = "
+        WrongKindError, match=r"'somebodys_package:broken' must be a TeacherKind, got function; write MINE = "
     ):
         make_teacher(spec("somebodys_package:broken"))
 
