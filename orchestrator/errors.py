@@ -73,14 +73,6 @@ class SweepBusyError(RecrlError):
     """Another process is running this sweep."""
 
 
-class ProcessTerminatedError(BaseException):
-    """SIGTERM ends this process, for example because its node is taken away.
-
-    It is no error of the user's code, which may raise any ``Exception`` or ``SystemExit``: the trial waits,
-    and continues from its last commit.
-    """
-
-
 class TeacherUnavailableError(RecrlError):
     """The teacher did not answer; nothing is lost, the trial can be resumed."""
 

@@ -83,7 +83,7 @@ class LaunchOutcome:
         result: of the trials.
         place: of the sweep's files.
         tracking_uri: of MLflow; None without MLflow.
-        sweep: the data frames; None if the launch was stopped, no trial is complete, or they cannot be read.
+        sweep: the data frames; None if the launch was stopped or no trial is complete.
     """
 
     result: SweepResult
@@ -131,8 +131,10 @@ def launch_grid(
 
     Raises:
         RecrlError: another process runs the sweep, or Ray, MLflow, the object store or the disk cannot be
-            used.
+            used, or the results cannot be read.
     """
+    from recrl.analysis.data import sweep_data  # noqa: PLC0415  (imports pandas)
+
     listener = listener or LaunchListener()
     store = SweepStore(options.root, grid.name)
     place = sweep_place(store, options.storage)
@@ -146,6 +148,7 @@ def launch_grid(
     uri = tracking_uri(store, options.tracking_uri) if options.mlflow else None
     stop = threading.Event()
     read: list[Sweep] = []  # at the end, if any trial is complete
+    unreadable: list[Exception] = []  # raised when MLflow is up to date
 
     def watch(plan: Plan) -> None:
         during.enter_context(listener.planned(plan, at_once=at_once, where=where))
@@ -156,8 +159,12 @@ def launch_grid(
         during.close()
         if stop.is_set():
             return
-        if after.counts[DisplayStatus.COMPLETE] and (sweep := _load(store, listener)):
-            read.append(sweep)
+        if after.counts[DisplayStatus.COMPLETE]:
+            try:
+                read.append(sweep_data.load(store))
+            except Exception as error:
+                unreadable.append(error)
+        for sweep in read:
             if options.figures:
                 _draw(sweep, store, listener)
             elif uri:
@@ -175,6 +182,8 @@ def launch_grid(
             finish=finish,
         )
         result = run_sweep(settings, stop=stop)
+    for error in unreadable:
+        raise error
     return LaunchOutcome(result, place, uri, read[0] if read else None)
 
 
@@ -245,18 +254,6 @@ def _inline_executor(grid: GridSpec, options: LaunchOptions) -> Executor:
 
 def _sync_to(uri: str) -> Callable[[SweepStore], RunningSync]:
     return lambda store: start_sync(store, uri, interval_seconds=SYNC_INTERVAL_SECONDS)
-
-
-def _load(store: SweepStore, listener: LaunchListener) -> Sweep | None:
-    """Read a launch's results; if that fails, report the error: MLflow must still be updated."""
-    from recrl.analysis.data import sweep_data  # noqa: PLC0415  (imports pandas)
-
-    try:
-        return sweep_data.load(store)
-    except Exception as error:
-        logger.debug("results of %s", store.name, exc_info=True)
-        listener.failed_to_draw(error)
-        return None
 
 
 def _draw(sweep: Sweep, store: SweepStore, listener: LaunchListener) -> None:

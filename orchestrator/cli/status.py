@@ -36,7 +36,7 @@ from recrl.orchestrator.trial_warnings import (
     no_curriculum_sentence,
 )
 
-REPEAT_SECONDS = 5.0  # between two requests to stop the same launch
+REPEAT_SECONDS = 5.0  # between two requests to stop a sweep
 
 
 def run_status(request: StatusRequest, console: Console) -> ExitCode:
@@ -124,7 +124,7 @@ def run_stop(request: StopRequest, console: Console) -> ExitCode:
         return ExitCode.OK
     say(console, f"{store.name}: its trials save their state")
     while _runs_for(REPEAT_SECONDS, still_runs):
-        place.request_stop()  # a launch that has just begun deletes earlier requests
+        still_runs = place.request_stop()  # a launch that has just begun deletes earlier requests
     place.refresh()
     say(console, f"{store.name}: {display.status_sentence(progress(store.specs(), store))}")
     return ExitCode.OK

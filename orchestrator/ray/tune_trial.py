@@ -8,18 +8,16 @@ from __future__ import annotations
 
 import json
 import logging
-import signal
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import ray
 from ray import tune
 
-from recrl.orchestrator.errors import DamagedError, ProcessTerminatedError
+from recrl.orchestrator.errors import DamagedError
 from recrl.orchestrator.files.sweep_store import SweepStore
+from recrl.orchestrator.ray.sigterm import noticing_sigterm
 from recrl.orchestrator.ray.teacher_service import RayTeacher, find_teacher_service
 from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.spec import TrialSpec
@@ -53,16 +51,20 @@ class TuneTrial(tune.Trainable):
         """
         from recrl.orchestrator.trial.attempt import run_recorded  # noqa: PLC0415  (imports torch; the driver does without)
 
-        if not self._stop_signal.is_set():
+        if self._stop_signal.is_set():
+            return {"done": True}
+        with noticing_sigterm() as got_sigterm:
+
+            def should_stop() -> bool:
+                return got_sigterm() or self._stop_signal.is_set()
+
             try:
-                with (
-                    _noticing_sigterm(),
-                    self._place.working_copy(self._spec, self._stop_signal.is_set) as trial,
-                ):
+                with self._place.working_copy(self._spec, should_stop) as trial:
                     run_recorded(
                         self._spec,
                         trial,
-                        should_stop=self._stop_signal.is_set,
+                        should_stop=should_stop,
+                        is_interrupted=got_sigterm,
                         teacher=self._teacher,
                         commit_seconds=self._commit_seconds,
                         on_gpu=bool(ray.get_gpu_ids()),
@@ -79,25 +81,6 @@ class TuneTrial(tune.Trainable):
         self._commit_seconds: float = config["commit_seconds"]
         name = config["teacher_service"]
         self._teacher = RayTeacher(self._spec.teacher, find_teacher_service(name)) if name else None
-
-
-@contextmanager
-def _noticing_sigterm() -> Iterator[None]:
-    """Raise ProcessTerminatedError in the body on SIGTERM, and SystemExit after it, which Ray expects.
-
-    Ray's own handler raises SystemExit at once, but a user's code may raise that as well.
-    """
-
-    def end_process(number: int, frame: FrameType | None) -> None:
-        raise ProcessTerminatedError
-
-    before = signal.signal(signal.SIGTERM, end_process)
-    try:
-        yield
-    except ProcessTerminatedError:
-        raise SystemExit(1) from None
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def spec_of(trial: Any) -> TrialSpec:

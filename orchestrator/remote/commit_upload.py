@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from recrl.orchestrator.background_thread import background_thread
-from recrl.orchestrator.errors import LostLeaseError, ProcessTerminatedError, StorageError
+from recrl.orchestrator.errors import LostLeaseError, StorageError
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.trial_files import FileKind, files_of
@@ -61,6 +61,7 @@ class Upload:
         self._number = 0
         self._shown: tuple[Any, ...] | None = None
         self._heartbeat_sent = float("-inf")
+        self._sending = threading.Lock()
 
     def follow(self) -> None:
         """Send new commits, if any, and regularly a heartbeat.
@@ -69,6 +70,10 @@ class Upload:
             StorageError: the store cannot be written; nothing is lost, the next call tries again.
             LostLeaseError: a newer attempt runs the trial.
         """
+        with self._sending:
+            self._follow()
+
+    def _follow(self) -> None:
         record = self._own_record()
         if record is None:
             return
@@ -79,12 +84,13 @@ class Upload:
 
     def finish(self) -> None:
         """Send the remaining commits, after the attempt's end; raise the errors of ``follow``."""
-        record = self._own_record()
-        if record is None:
-            return
-        self._send_heartbeat(replace(record, heartbeat=time.time()))  # uploads may take long
-        self.push()
-        self._remote.objects.delete([f"{attempt_of(record)}/{ALIVE}"])
+        with self._sending:
+            record = self._own_record()
+            if record is None:
+                return
+            self._send_heartbeat(replace(record, heartbeat=time.time()))  # uploads may take long
+            self.push()
+            self._remote.objects.delete([f"{attempt_of(record)}/{ALIVE}"])
 
     def _own_record(self) -> TrialRecord | None:
         """Return the record of the attempt to upload; None before it has begun."""
@@ -217,7 +223,8 @@ def working_copy(
     Args:
         remote: the trial in the store.
         spec: the trial.
-        should_stop: once true, the wait for a store that is down is at most ``STOPPING_SECONDS``.
+        should_stop: once true, the wait for a store that is down is at most ``STOPPING_SECONDS``. After a
+            SystemExit, which SIGTERM raises, there is none.
 
     Raises:
         DamagedError: the store has commits of the trial, and none can be used.
@@ -229,15 +236,17 @@ def working_copy(
         retry_while_down(lambda: remote.download_for_attempt(trial), should_stop)
         upload = Upload(remote, trial)
         try:
-            with background_thread(partial(_follow, upload), name="upload"):
-                yield trial
-        except ProcessTerminatedError:  # there is little time
-            _finish(upload, lambda: True)
-            raise
-        except Exception:  # but not a KeyboardInterrupt, which ends at once
+            try:
+                with background_thread(partial(_follow, upload), name="upload"):
+                    yield trial
+            except Exception:  # but not a KeyboardInterrupt, which ends at once
+                _finish(upload, should_stop)
+                raise
             _finish(upload, should_stop)
+        except SystemExit:  # SIGTERM: there is little time
+            with suppress(StorageError, LostLeaseError):
+                upload.finish()
             raise
-        _finish(upload, should_stop)
 
 
 @contextmanager

@@ -55,7 +55,7 @@ class BackgroundSync:
         try:
             return self.process.wait(timeout) == 0
         except subprocess.TimeoutExpired:
-            with suppress(ProcessLookupError):
+            with suppress(ProcessLookupError, PermissionError):  # it has just ended
                 os.killpg(self.process.pid, signal.SIGKILL)  # with the process that writes the export file
             self.process.wait()
             return False

@@ -14,7 +14,6 @@ from recrl.agents.evaluation import StoppedError
 from recrl.orchestrator.errors import (
     USERS_ERRORS,
     LostLeaseError,
-    ProcessTerminatedError,
     StorageError,
     TeacherUnavailableError,
     described,
@@ -140,6 +139,7 @@ def run_recorded(
     store: TrialStore,
     *,
     should_stop: Callable[[], bool],
+    is_interrupted: Callable[[], bool] = lambda: False,
     teacher: Teacher | None = None,
     commit_seconds: float = COMMIT_SECONDS,
     on_gpu: bool = False,
@@ -154,6 +154,8 @@ def run_recorded(
         spec: the trial.
         store: the trial's folder.
         should_stop: see ``run_trial``.
+        is_interrupted: called after an error; if true, it came from SIGTERM to this process, which interrupts
+            any code, and the trial waits.
         teacher: sets the limits; made from the spec if None.
         commit_seconds: see ``run_trial``.
         on_gpu: whether to learn on CUDA. A trial that cannot is FAILED.
@@ -163,7 +165,7 @@ def run_recorded(
 
     Raises:
         TeacherUnavailableError: the teacher does not answer; the trial waits to be resumed.
-        ProcessTerminatedError: the process got SIGTERM, and ``should_stop`` is false; likewise.
+        SystemExit: of SIGTERM, before the trial began.
     """
     provenance = {
         **collect_provenance(),
@@ -194,13 +196,10 @@ def run_recorded(
         except StorageError as error:
             logger.error("%s", error)
             return _close(writer, TrialStatus.WAITING, error=str(error))
-        except ProcessTerminatedError:
-            logger.warning("the process got SIGTERM; the trial waits to be resumed")
-            status = _close(writer, TrialStatus.WAITING)
-            if should_stop():  # a second signal to a stopping worker
-                return status
-            raise
         except USERS_ERRORS as error:
+            if is_interrupted():
+                logger.warning("the process got SIGTERM; the trial waits to be resumed")
+                return _close(writer, TrialStatus.WAITING)
             logger.exception("failed; rows and checkpoint end at the last commit")
             notes = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
             text = shown(f"{described(error)}{notes}")

@@ -12,7 +12,8 @@ import torch
 from recrl.agents.agent import Rollout
 from recrl.agents.building_blocks.learning_batch import LearningBatch
 from recrl.agents.collection import Collector, episode_costs
-from recrl.agents.learning.actor_critic import ActorCritic
+from recrl.agents.errors import DivergedError
+from recrl.agents.learning.actor_critic import ActorCritic, _mean_squared_returns
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep, Floats
 from recrl.environments.registry import make_vector
@@ -89,6 +90,37 @@ def test_advantages_and_targets_are_those_of_a_loop_over_the_steps(
     measured = found.explained_variances()
     names = ("explained_variance_reward", "explained_variance_cost_0", "explained_variance_cost_1")
     assert [measured[name] for name in names] == pytest.approx(explained, rel=1e-4)
+
+
+def test_a_new_scale_of_the_targets_leaves_the_values_as_they_are() -> None:
+    agent, rollout = learnt_agent({})
+    before, scale = values_of(agent, rollout.observations), agent._value_scale.values.copy()
+    scaled, after = agent._scaled(np.full((5, 3), 100.0))
+    assert (after > 2.0 * scale).all()
+    np.testing.assert_allclose(scaled * after, 100.0)
+    np.testing.assert_allclose(values_of(agent, rollout.observations), before, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("part", "name"), [("_network", "policy"), ("_critics", "critic")])
+def test_parameters_that_are_not_finite_are_named(
+    monkeypatch: pytest.MonkeyPatch, part: str, name: str
+) -> None:
+    agent, rollout = learnt_agent({})
+
+    def diverge(*_: object) -> dict[str, float]:
+        getattr(agent, part).parameters.values.fill_(np.nan)
+        return {}
+
+    monkeypatch.setattr(agent, "_learn", diverge)
+    with pytest.raises(DivergedError, match=f"^{name} parameters must be finite"):
+        agent.update(rollout, np.empty((0, 2)), CurriculumStep(CostLimits((3.0, 3.0))))
+
+
+def test_the_first_scale_is_that_of_the_discounted_returns() -> None:
+    signals = np.array([1.0, 2.0, 3.0])[:, None, None]
+    ended = np.array([[False], [True], [False]])
+    # With a discount of 0.5 the returns are 1 + 2 / 2, 2 and 3.
+    assert _mean_squared_returns(signals, ended, 0.5) == pytest.approx([(4.0 + 4.0 + 9.0) / 3.0])
 
 
 @pytest.mark.parametrize(("constraint", "own"), [("mean", {"constraint"}), ("cvar", set())])

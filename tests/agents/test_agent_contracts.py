@@ -239,7 +239,7 @@ def test_a_reward_that_is_not_a_number_is_named(agent: str) -> None:
 
 
 @every_agent
-def test_parameters_that_diverge_are_named(agent: str) -> None:
+def test_learning_that_diverges_is_an_error(agent: str) -> None:
     lessons = Lessons(agent, "two-state")
     state = lessons.agent.state_dict()
     state["critics"] = np.full_like(state["critics"], np.nan)

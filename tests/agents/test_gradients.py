@@ -13,7 +13,6 @@ from recrl.agents.algorithms.ipo import barrier_surrogate_objective
 from recrl.agents.algorithms.own_options import IPOConfig
 from recrl.agents.algorithms.p3o import penalised_surrogate_objective
 from recrl.agents.algorithms.ppo_lag import combined_surrogate_objective, separate_surrogate_objective
-from recrl.agents.building_blocks.critics import Critics
 from recrl.agents.building_blocks.distributions import Distribution
 from recrl.agents.building_blocks.learning_batch import LearningBatch
 from recrl.agents.building_blocks.policies import StochasticPolicy
@@ -138,18 +137,4 @@ def test_an_objectives_gradient_is_its_finite_differences(
         policy.parameters, lambda: float(of_policy(policy.distribution(experience.batch.unique_observations)))
     )
     assert np.abs(expected).max() > 1e-3
-    np.testing.assert_allclose(exact, expected, atol=1e-7)
-
-
-def test_the_critics_gradient_is_its_finite_differences(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tanh_stack, "BLOCK_ROWS", 7)
-    generator = torch.Generator().manual_seed(0)
-    critics = Critics(3, 2, FORM, generator)
-    rows, targets = torch.randn(20, 3, generator=generator), torch.randn(3, 20, generator=generator)
-    weights = torch.softmax(torch.randn(20, generator=generator), dim=0)
-    critics.differentiate(rows, weights, targets)
-    exact = critics.parameters.gradient.clone().numpy()
-    expected = differences(
-        critics.parameters, lambda: float(critics.differentiate(rows, weights, targets).sum())
-    )
     np.testing.assert_allclose(exact, expected, atol=1e-7)

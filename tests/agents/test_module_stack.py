@@ -17,10 +17,10 @@ from recrl.agents.networks.flat_parameters import FlatParameters
 from recrl.agents.networks.module_stack import ModuleStack, checked_module
 from recrl.agents.networks.tanh_stack import TanhStack
 from recrl.agents.registry import make_agent
-from recrl.agents.spaces import observation_size
 from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.plugins import UntrustedNameError, refuse_import_paths
 from recrl.environments.registry import make_vector
+from recrl.orchestrator.files.checkpoint_format import decode, encode
 
 SIZES, NETWORKS, ROWS = (3, 5, 4, 2), 2, 7
 AGENTS = ["ppo-lag", "cpo", "focops", "trpo-lag", "pcpo"]
@@ -180,11 +180,16 @@ def test_agents_learn_with_other_networks_and_resume_exactly(
     np.testing.assert_array_equal(state["policy"], again.state_dict()["policy"])
     fresh = trained(agent, task, options, updates=0)
     assert not np.array_equal(fresh.state_dict()["policy"], state["policy"])
-    fresh.load_state_dict(state)
-    size = observation_size(make_vector(task, 1).cmdp.observation_space)
-    observations = np.zeros((2, size), np.float32)
-    np.testing.assert_array_equal(fresh.act_greedily(observations), once.act_greedily(observations))
-    noisy = once.add_noise(0.5, observations)
+    fresh.load_state_dict(decode(encode(state), source="memory"))
+    collector, generator = Collector(make_vector(task, 4), num_steps=20), np.random.default_rng(3)
+    collector.reset(seed=2)
+    for _ in range(2):
+        rollout, episodes = collector.collect(once, generator)
+        costs, step = episode_costs(episodes, 1), CurriculumStep(CostLimits((1.0,)))
+        assert repr(fresh.update(rollout, costs, step)) == repr(once.update(rollout, costs, step))
+    for part in ("policy", "critics"):
+        np.testing.assert_array_equal(fresh.state_dict()[part], once.state_dict()[part])
+    noisy = once.add_noise(0.5, rollout.observations[0])
     assert noisy["randomness_after"] >= noisy["randomness_before"]
 
 

@@ -106,7 +106,7 @@ def test_a_relative_gap_has_no_unit() -> None:
 
 
 @pytest.mark.parametrize("rule", STARTS)
-def test_no_limit_means_no_multiplier_and_leaves_no_trace(rule: str) -> None:
+def test_without_a_limit_a_rule_keeps_its_state(rule: str) -> None:
     steps = {
         "projected": lambda state, gaps: projected_ascent(state, gaps, step_size=0.1, maximum=10.0),
         "softplus-adam": lambda state, gaps: softplus_adam(state, gaps, learning_rate=0.1),

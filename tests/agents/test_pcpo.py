@@ -19,13 +19,11 @@ from recrl.agents.algorithms.crpo import (
 from recrl.agents.algorithms.own_options import CRPOConfig, PCPOConfig, TRPOLagConfig
 from recrl.agents.algorithms.pcpo import projected_step
 from recrl.agents.algorithms.trpo_lag import TRPOLagrangian
-from recrl.agents.building_blocks.learning_batch import LearningBatch
-from recrl.agents.building_blocks.policy_families import make_policy
 from recrl.agents.experience import Constraints, Experience
 from recrl.agents.learning.policy_rule import PolicyRule, improve_and_measure
-from recrl.agents.networks.architecture import NetworkArchitecture, orthogonal
 from recrl.agents.trust_region.cpo_dual import StepCase, StepProblem, projection_weights
 from recrl.environments.cmdp import Floats
+from tests.agents.sampled import sampled
 
 DELTA = 0.01
 SPACES = [Discrete(3), Box(-1.0, 1.0, (2,))]
@@ -144,15 +142,7 @@ def improved(
     name: str, space: Space[object], gaps: list[float], limits: list[float]
 ) -> tuple[dict[str, float], Floats]:
     """The metrics of one update, and how the policy's parameters have changed."""
-    generator = np.random.default_rng(0)
-    policy = make_policy(
-        3, space, NetworkArchitecture((8, 8), orthogonal), 0.1, torch.Generator().manual_seed(0)
-    )
-    observations = generator.normal(size=(400, 3)).astype(np.float32)
-    actions = policy.sample(observations, generator)
-    liked = actions.astype(np.float64) if actions.ndim == 1 else actions[:, 0].astype(np.float64)
-    advantages = np.stack([liked, 0.8 * liked, observations[:, 1] * liked], axis=1)
-    batch = LearningBatch.deduplicate(observations, actions, compact=True)
+    policy, batch, advantages = sampled(space)
     before, old = policy.parameters.to_numpy(), policy.distribution(batch.unique_observations)
     length = math.nan if math.isnan(gaps[0]) else 10.0
     constraints = Constraints(np.array(limits), np.array(gaps), np.zeros(len(limits)), length)

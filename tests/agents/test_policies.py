@@ -143,25 +143,6 @@ def test_the_fisher_metric_is_the_hessian_of_the_divergence(space: Space[object]
     torch.testing.assert_close(metric(vector), hessian @ vector + 0.1 * vector)
 
 
-@pytest.mark.usefixtures("double_precision")
-@pytest.mark.parametrize("space", SPACES)
-def test_the_gradient_of_a_loss_agrees_with_finite_differences(space: Space[object]) -> None:
-    policy, rows = policy_for(space), random_rows()
-    target = policy_for(space)
-    target.parameters.values.add_(0.3)
-    weights = torch.full((6,), 1.0 / 6.0)
-    goal = target.distribution(rows)
-    now = policy.evaluate(rows)
-    gradient = now.gradient(mean_divergence(now.distribution, goal, weights)).clone()
-    for index in range(0, len(gradient), 5):
-        values = []
-        for change in (1e-6, -1e-6):
-            policy.parameters.values[index] += change
-            values.append(float(mean_divergence(policy.distribution(rows), goal, weights)))
-            policy.parameters.values[index] -= change
-        assert gradient[index].item() == pytest.approx((values[0] - values[1]) / 2e-6, abs=1e-8)
-
-
 @pytest.mark.parametrize("noise", [0.01, 0.3, 1.0])
 def test_noise_makes_a_policy_as_random_as_its_mixture_with_a_uniform_one(noise: float) -> None:
     logits = np.array([[0.0, 30.0, 1.0], [5.0, 0.0, -4.0]])
@@ -215,6 +196,25 @@ def test_noise_makes_a_policy_more_random(space: Space[object], form: str) -> No
     assert set(metrics) == {"noise_scale", "randomness_before", "randomness_after"}
     assert metrics["randomness_after"] > metrics["randomness_before"]
     assert float(policy.distribution(rows).entropy().mean()) > before
+
+
+@pytest.mark.parametrize(("noise", "scale"), [(0.3, 0.7), (1.0, 0.0)])
+def test_a_temperature_scales_logits_by_what_noise_leaves(noise: float, scale: float) -> None:
+    policy, rows = policy_for(THREE_ACTIONS, last_scale=5.0), random_rows()
+    before = policy.outputs(rows.numpy())
+    assert policy.add_noise(noise, rows.numpy(), "temperature")["noise_scale"] == pytest.approx(scale)
+    policy.publish()
+    np.testing.assert_allclose(policy.outputs(rows.numpy()), scale * before, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("noise", "scale"), [(0.3, 1.0 / 0.7), (1.0, 1000.0)])
+def test_a_temperature_divides_standard_deviations_by_what_noise_leaves(noise: float, scale: float) -> None:
+    policy = policy_for(TWO_COMPONENTS)
+    assert isinstance(policy, GaussianPolicy)
+    before = policy.log_std.exp().clone()
+    metrics = policy.add_noise(noise, random_rows().numpy(), "temperature")
+    assert metrics["noise_scale"] == pytest.approx(scale, rel=1e-5)
+    torch.testing.assert_close(policy.log_std.exp(), scale * before)
 
 
 def test_the_strongest_noise_is_that_of_uniform_actions() -> None:

@@ -28,13 +28,8 @@ from recrl.orchestrator.tracking.export_file import ExportUpload, write_in_own_p
 from recrl.orchestrator.tracking.mlflow_runs import SweepRuns
 from recrl.orchestrator.tracking.mlflow_sync import Tracker, sync
 from recrl.orchestrator.tracking.positions import Position
-from recrl.orchestrator.tracking.ui import UI, open_ui
+from recrl.orchestrator.tracking.ui import open_ui
 from tests.faults.committing import commit_file
-
-with socket.socket() as free:
-    free.bind(("127.0.0.1", 0))
-    PORT = free.getsockname()[1]
-SERVER = f"http://127.0.0.1:{PORT}"
 
 
 def write(store: SweepStore, path: Path) -> None:
@@ -74,9 +69,13 @@ def exported(sweep: SweepStore, tmp_path_factory: pytest.TempPathFactory) -> Swe
 
 
 @pytest.fixture(scope="module")
-def server(sweep: SweepStore) -> Iterator[UI]:
-    ui = open_ui(sweep, tracking_uri(sweep, None), port=PORT)
-    yield ui
+def server(sweep: SweepStore) -> Iterator[str]:
+    """The address of MLflow's server for the sweep."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    ui = open_ui(sweep, tracking_uri(sweep, None), port=port)
+    yield f"http://127.0.0.1:{port}"
     ui.close()
 
 
@@ -126,9 +125,8 @@ def test_afterwards_mlflow_has_the_settings_of_the_user(
     assert dict(os.environ) == before
 
 
-@pytest.mark.usefixtures("server")
-def test_a_server_gives_the_same(exported: Sweep) -> None:
-    same(from_mlflow.load(SERVER, "made-up"), exported)
+def test_a_server_gives_the_same(server: str, exported: Sweep) -> None:
+    same(from_mlflow.load(server, "made-up"), exported)
 
 
 def test_nothing_new_is_not_uploaded_again(

@@ -197,3 +197,6 @@ def test_interquartile_means_carry_their_warning(finished: Sweep) -> None:
     rows = metrics.robust_summary(metrics.outcomes(finished), np.random.default_rng(0))
     assert rows["too_few_seeds"].all()
     assert (rows["iqm_low"] <= rows["iqm"]).all()
+    row = only(rows, task="river-a", agent="cpo", method="none", measure="stochastic")
+    assert row["seeds"] == 3
+    assert row["iqm"] == pytest.approx(-22.0 / 3.0)  # of 8, -15 and -15: a quarter of three is none

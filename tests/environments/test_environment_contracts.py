@@ -197,7 +197,7 @@ def test_what_was_returned_is_not_changed_by_later_steps(name: str) -> None:
     assert all(np.array_equal(now, then) for now, then in zip(returned, copies, strict=True))
 
 
-def test_the_options_of_reset_are_a_mask_or_refused(name: str) -> None:
+def test_a_reset_by_a_mask_is_a_restart(name: str) -> None:
     environment, twin = build(name), build(name)
     environment.reset(seed=0)
     twin.reset(seed=0)

@@ -393,6 +393,8 @@ def test_keywords_of_gymnasium_and_of_the_class_are_passed_on() -> None:
     options = {"id": "CartPole-v1", "costless": True, "keywords": keywords}
     made = make_vector("gymnasium", 1, options=options)
     assert made.cmdp.horizon == 7
+    made.reset(seed=0)
+    assert made.step(np.array([0]))[1].tolist() == [0.0]  # Sutton and Barto's reward; else it is 1
     made.close()
 
 
@@ -530,10 +532,6 @@ def _nothing() -> gymnasium.Env[Any, Any]:
     return _breezy()
 
 
-def _any_option(**_: Any) -> gymnasium.Env[Any, Any]:
-    return _breezy()
-
-
 @pytest.mark.parametrize(
     ("factory", "options", "sentence"),
     [
@@ -556,8 +554,19 @@ def test_a_wrong_option_of_a_users_task_names_the_known_ones(
 
 @pytest.mark.parametrize("options", [{}, {"wind": 1.0, "length": 2}])
 def test_right_options_of_a_users_task_are_passed_on(options: dict[str, Any]) -> None:
-    make_from_callable(_breezy, "breezy", 1, KeywordOptions(**options)).close()
-    make_from_callable(_any_option, "breezy", 1, KeywordOptions(**options)).close()
+    given: list[dict[str, Any]] = []
+
+    def of_two(wind: float = 0.0, *, length: int = 3) -> gymnasium.Env[Any, Any]:
+        given.append({"wind": wind, "length": length})
+        return _breezy()
+
+    def of_any(**keywords: Any) -> gymnasium.Env[Any, Any]:
+        given.append(keywords)
+        return _breezy()
+
+    for factory in (of_two, of_any):
+        make_from_callable(factory, "breezy", 1, KeywordOptions(**options)).close()
+    assert given == [{"wind": 0.0, "length": 3} | options, options]
 
 
 class Strict(Countdown):

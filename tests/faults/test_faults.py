@@ -393,10 +393,8 @@ def test_a_hung_trial_starts_again_and_a_signal_to_the_group_saves_them_all(tmp_
     os.kill(hung, signal.SIGSTOP)
     wait_for("the hung one again")
     assert not Path(f"/proc/{hung}").exists()
-    asked_at = time.monotonic()
     os.killpg(process.pid, signal.SIGTERM)
     out, _ = process.communicate(timeout=60.0)
-    assert time.monotonic() - asked_at < 20.0
     assert process.returncode == ExitCode.STOPPED, out
     assert "Stopped; nothing is lost." in out
     for trial in store.trials():

@@ -36,6 +36,8 @@ from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.spec import Choice, TrialStatus
 from recrl.orchestrator.sweep_place import SweepPlace
+from recrl.orchestrator.tracking.client import tracking_uri
+from recrl.orchestrator.tracking.mlflow_sync import last_report
 from recrl.orchestrator.trial import speed
 from recrl.orchestrator.trial.saved_policy import SavedTrial
 from recrl.orchestrator.trial.speed import measured_speed
@@ -252,10 +254,12 @@ def test_results_that_cannot_be_read_at_the_end_end_no_launch(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sweep_data, "load", Mock(side_effect=DamagedError("spec.json: is cut off")))
-    assert main(["launch", "grid.yaml", *INLINE[:-1]]) == ExitCode.OK
-    said = capsys.readouterr().out
-    assert "Figures    not all are drawn (DamagedError: spec.json: is cut off)\n" in said
-    assert "Results    runs/small\n" in said
+    assert main(["launch", "grid.yaml", "--executor", "inline"]) == ExitCode.CANNOT_RUN
+    assert capsys.readouterr().err.endswith("recrl-sweep: spec.json: is cut off\n")
+    store = SweepStore(folder / "runs", "small")
+    report = last_report(store, tracking_uri(store, None))
+    assert report is not None
+    assert report.is_up_to_date
 
 
 def test_only_some_trials(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

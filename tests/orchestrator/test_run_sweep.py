@@ -6,6 +6,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -265,7 +266,9 @@ def test_a_second_signal_may_come_twice_as_well() -> None:
             os.kill(os.getpid(), signal.SIGTERM)  # would end this process
 
 
-def test_signals_at_the_same_time_are_one() -> None:
+def test_signals_at_the_same_time_are_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SimpleNamespace(monotonic=lambda: 0.0, sleep=lambda _: None)
+    monkeypatch.setattr("recrl.orchestrator.run_sweep.time", clock)
     stop = threading.Event()
     with stopping_on_signals(stop, lambda: None):
         for _ in range(50):

@@ -413,7 +413,9 @@ def test_tasks_say_what_is_wrong() -> None:
 
 def test_a_task_may_have_an_option_called_task(folder: Path) -> None:
     (folder / "named.py").write_text(
-        OWN_TASK.replace("def make(render_mode=None):", "def make(task=1, render_mode=None):")
+        OWN_TASK.replace(
+            "def make(render_mode=None):", "def make(task=1, render_mode=None):\n    assert task == 2"
+        )
     )
     for made in (recrl.make("named:make", task=2), recrl.make_env("named:make", task=2)):
         made.close()
