@@ -13,7 +13,8 @@ training budget the agent learns without limits in the infinite dimensions. Then
 
 where windows are consecutive and of at least 32 finished episodes. First episodes that are cut, to spread the
 environments over an episode's steps, do not count. If no window is complete by then, the episodes so far are
-one, possibly fewer than 32. If no episode has finished by then, the measurement continues until one has.
+one, possibly fewer than 32. If no episode has finished by then, the measurement continues until one has. As
+the largest of many means d_t is somewhat above what the agent costs on average.
 
 Notation: k the number of costs, B the training budget in environment steps, f = ``start_fraction``.
 """

@@ -123,7 +123,8 @@ class CPOConfig(TrustRegionConfig):
     violation_integral_gain: NonNegative = Field(
         default=0.03,
         description="K of the integral of the violations, per update. Costs fall by less than the "
-        "linear model predicts; the integral corrects that (ours; paper 0).",
+        "linear model predicts; the integral corrects that (after safety-starter-agents' learn_margin, with "
+        "bounds of ours; paper 0).",
     )
 
 

@@ -93,8 +93,8 @@ def linearise(
     solved = torch.stack(
         [conjugate_gradient(metric, each, iterations=config.conjugate_gradient_steps) for each in chosen]
     )
-    # The product u.H u for u = H^-1 v, as in safety-starter-agents, not v.u: if conjugate gradients have not
-    # converged, this is the true size of the step.
+    # Products u.H w, as in safety-starter-agents. For u = w it is the gradient times u at every iterate of
+    # conjugate gradients. For others only once they have converged; until then this gives the step's length.
     products = torch.stack([metric(direction) for direction in solved])
     gram = (solved @ products.T).numpy(force=True).astype(np.float64)
     require_finite("products of the trust region's directions", gram)

@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 
 from pydantic import ValidationError
 
-from recrl.environments.plugins import UnknownNameError, UntrustedNameError
+from recrl.environments.plugins import UnknownNameError, UntrustedNameError, WrongKindError
 from recrl.environments.registry import optimal_return
 from recrl.orchestrator.errors import USERS_ERRORS, described
 from recrl.orchestrator.spec import TrialSpec
@@ -43,7 +43,7 @@ def optima_of(
 
 
 def _reason(error: BaseException) -> str:
-    if isinstance(error, UnknownNameError | UntrustedNameError):
+    if isinstance(error, UnknownNameError | UntrustedNameError | WrongKindError):
         return str(error)
     if isinstance(error, ValidationError):
         place, sentence = next(sentences(error, None))

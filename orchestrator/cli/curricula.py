@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 from rich.console import Console
 
-from recrl.environments.plugins import UnknownNameError, UntrustedNameError
+from recrl.environments.plugins import UnknownNameError, UntrustedNameError, WrongKindError
 from recrl.orchestrator.cli.output import say, short, show
 from recrl.orchestrator.cli.requests import BoundRequest, ReplayRequest
 from recrl.orchestrator.cli.results import require_undamaged, say_warnings, source
@@ -186,7 +186,7 @@ def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
         raise RecrlError(f"--option: {error}") from error
     except UntrustedNameError as error:
         raise RecrlError(f"{error}; {TRUST_HINT}") from error
-    except UnknownNameError as error:
+    except (UnknownNameError, WrongKindError) as error:
         raise RecrlError(str(error)) from error
     except USERS_ERRORS as error:
         raise RecrlError(f"teacher {method.name!r} cannot be used: {described(error)}") from error

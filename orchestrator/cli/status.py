@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -36,7 +37,7 @@ from recrl.orchestrator.trial_warnings import (
     no_curriculum_sentence,
 )
 
-REPEAT_SECONDS = 5.0  # between two requests to stop a sweep
+REPEAT_SECONDS = 5.0  # from a request to stop to its repetition
 
 
 def run_status(request: StatusRequest, console: Console) -> ExitCode:
@@ -123,15 +124,15 @@ def run_stop(request: StopRequest, console: Console) -> ExitCode:
         say(console, f"{store.name}: no launch runs this sweep")
         return ExitCode.OK
     say(console, f"{store.name}: its trials save their state")
-    while _runs_for(REPEAT_SECONDS, still_runs):
-        still_runs = place.request_stop()  # a launch that has just begun deletes earlier requests
+    if _runs_for(REPEAT_SECONDS, still_runs):
+        _runs_for(math.inf, place.request_stop())  # a launch that has just begun deletes earlier requests
     place.refresh()
     say(console, f"{store.name}: {display.status_sentence(progress(store.specs(), store))}")
     return ExitCode.OK
 
 
 def _runs_for(seconds: float, still_runs: Callable[[], bool]) -> bool:
-    """Wait for the end of a launch for some time; return whether it runs after that."""
+    """Wait for the end of a launch, but not longer than some seconds; return whether it runs after that."""
     end = time.monotonic() + seconds
     while running := still_runs():
         if time.monotonic() >= end:

@@ -13,7 +13,7 @@ def noticing_sigterm() -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether this process got SIGTERM; then the body ends with SystemExit.
 
     The first signal interrupts the body with a SystemExit, as Ray's own handler does: ``ray.get`` passes on
-    no other exception. A user's code may raise a SystemExit as well, or catch this one.
+    this and KeyboardInterrupt only. A user's code may raise a SystemExit as well, or catch this one.
 
     Raises:
         SystemExit: after SIGTERM, whatever the body did with the interruption.

@@ -223,8 +223,8 @@ def working_copy(
     Args:
         remote: the trial in the store.
         spec: the trial.
-        should_stop: once true, the wait for a store that is down is at most ``STOPPING_SECONDS``. After a
-            SystemExit, which SIGTERM raises, there is none.
+        should_stop: once true, the wait for a store that is down is at most ``STOPPING_SECONDS``. If the body
+            ends with SystemExit, there is none.
 
     Raises:
         DamagedError: the store has commits of the trial, and none can be used.
@@ -243,7 +243,7 @@ def working_copy(
                 _finish(upload, should_stop)
                 raise
             _finish(upload, should_stop)
-        except SystemExit:  # SIGTERM: there is little time
+        except SystemExit:  # SIGTERM outside of the trial
             with suppress(StorageError, LostLeaseError):
                 upload.finish()
             raise

@@ -165,7 +165,7 @@ def run_recorded(
 
     Raises:
         TeacherUnavailableError: the teacher does not answer; the trial waits to be resumed.
-        SystemExit: of SIGTERM, before the trial began.
+        SystemExit: of SIGTERM, before the trial began or while its end was recorded.
     """
     provenance = {
         **collect_provenance(),

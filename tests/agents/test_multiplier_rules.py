@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import brentq
+from scipy.stats import binom
 
 from recrl.agents.constraints.multiplier_rules import (
     STARTS,
@@ -103,6 +105,32 @@ def test_a_relative_gap_has_no_unit() -> None:
     values = np.array([30.0, -10.0]), np.array([25.0, 25.0]), np.array([7.0, 0.0])
     larger = (1024.0 * each for each in values)
     assert relative_gaps(*larger).tolist() == relative_gaps(*values).tolist()
+
+
+@pytest.mark.parametrize(
+    ("cost", "limit", "clipped", "unclipped", "true_error"),
+    [(100.0, 25.0, 1.01, 1.01, 1.00), (10.0, 1.0, 1.11, 1.09, 1.03), (50.0, 1.0, 2.54, 2.36, 1.19)],
+)
+def test_the_mean_cost_settles_where_the_documentation_says(
+    cost: float, limit: float, clipped: float, unclipped: float, true_error: float
+) -> None:
+    """The mean cost at which an integral keeps its value on average; 16 episodes cost 0 or the same."""
+    costly = np.arange(17)
+    share = costly / 16.0
+    own_errors = cost * np.sqrt(share * (1.0 - share) / 15.0)
+
+    def settled(largest: float, *, uses_true_error: bool) -> float:
+        def drift(probability: float) -> float:
+            error = cost * math.sqrt(probability * (1.0 - probability) / 16.0)
+            errors = np.full(17, error) if uses_true_error else own_errors
+            gaps = relative_gaps(share * cost - limit, np.full(17, limit), errors)
+            return float(binom.pmf(costly, 16, probability) @ np.minimum(gaps, largest))
+
+        return brentq(drift, 1e-6, 0.999) * cost / limit
+
+    found = [settled(1.0, uses_true_error=False), settled(math.inf, uses_true_error=False)]
+    found.append(settled(1.0, uses_true_error=True))
+    assert found == pytest.approx([clipped, unclipped, true_error], abs=0.005)
 
 
 @pytest.mark.parametrize("rule", STARTS)

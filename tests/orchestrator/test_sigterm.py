@@ -9,35 +9,44 @@ import pytest
 from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.ray.sigterm import noticing_sigterm
 
+Log = Callable[[str], None]
 
-def interrupted() -> None:
+
+def signalled(log: Log) -> None:
     os.kill(os.getpid(), signal.SIGTERM)
-    raise AssertionError("the signal interrupts")
+    log("not interrupted")
 
 
-def swallowed() -> None:
+def swallowing(log: Log) -> None:
     try:
-        interrupted()
+        signalled(log)
     except SystemExit:
-        os.kill(os.getpid(), signal.SIGTERM)  # a second signal interrupts nothing
+        log("swallowed")
+        signalled(log)  # only the first signal interrupts
 
 
-def replaced() -> None:
+def replacing(log: Log) -> None:
     try:
-        interrupted()
+        signalled(log)
     except SystemExit as error:
         raise StorageError("the object store is down") from error
 
 
-@pytest.mark.parametrize("body", [interrupted, swallowed, replaced])
-def test_sigterm_is_noticed_whatever_the_body_does_with_it(body: Callable[[], None]) -> None:
-    before = signal.getsignal(signal.SIGTERM)
+@pytest.mark.parametrize(
+    ("body", "expected"),
+    [(signalled, []), (swallowing, ["swallowed", "not interrupted"]), (replacing, [])],
+)
+def test_sigterm_is_noticed_whatever_the_body_does_with_it(
+    body: Callable[[Log], None], expected: list[str]
+) -> None:
+    before, log = signal.getsignal(signal.SIGTERM), []
     with pytest.raises(SystemExit) as caught, noticing_sigterm() as got_sigterm:
+        log.append(str(got_sigterm()))
         try:
-            assert not got_sigterm()
-            body()
+            body(log.append)
         finally:
-            assert got_sigterm()
+            log.append(str(got_sigterm()))
+    assert log == ["False", *expected, "True"]
     assert caught.value.code == 1
     assert signal.getsignal(signal.SIGTERM) is before
 

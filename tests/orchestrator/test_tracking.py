@@ -1073,7 +1073,7 @@ def test_a_killed_sync_leaves_nothing_lost_and_nothing_twice(write: Callable[...
 
 
 def test_a_killed_sync_takes_its_children_along(tmp_path: Path) -> None:
-    program = "import subprocess as s; c = s.Popen(['sleep', '60']); print(c.pid, flush=True); c.wait()"
+    program = "import subprocess as s; c = s.Popen(['sleep', '600']); print(c.pid, flush=True); c.wait()"
     process = subprocess.Popen(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, start_new_session=True
     )
