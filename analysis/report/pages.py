@@ -194,7 +194,8 @@ def remarks(sweep: Sweep) -> list[str]:
             reason = f": {row['error']}" if row["error"] else ""
             title = f"{row['task']} {row['agent']} {row['method']} seed {row['seed']}"
             sentences.append(f"{title}: {what}, {done:.0%} of its steps done{reason}")
-    seeds = sweep.trials.groupby(list(GROUP), observed=True)["seed"].nunique()
+    complete = sweep.trials[sweep.trials["status"] == TrialStatus.COMPLETE.value]
+    seeds = complete.groupby(list(GROUP), observed=True)["seed"].nunique()
     few = sorted({int(count) for count in seeds if count < ENOUGH_RUNS})
     if few and few != [1]:  # one seed: the answers say so
         sentences.append(

@@ -69,6 +69,7 @@ FAILED_CLAIMS_NOTE = "In a seed with a failed trial a claim does not hold."
 FAILED_NOTE = (
     "A failed trial counts as neither feasible nor solved; the means are over the n complete trials."
 )
+FAILED_PAIRS_NOTE = "failed: trials of the curriculum or of none; their seeds are not among the n pairs."
 NO_GAIN = (
     "–: a policy of a pair is infeasible, with one curriculum or the other; more return is then no gain."
 )
@@ -251,6 +252,7 @@ def _comparison_tables(
             TIES,
             FEW if marked else "",
             NO_GAIN if dashed else "",
+            FAILED_PAIRS_NOTE if rows["failed"].any() else "",
             table_formats.not_corrected(table),
         ]
         note = " ".join(filter(None, notes))

@@ -97,7 +97,9 @@ def names_of(row: pd.Series) -> dict[str, str]:
 
 
 def compared_rows(comparisons: pd.DataFrame, summary: pd.DataFrame, measure: Measure) -> pd.DataFrame:
-    """Return the comparisons of one measure, with ``seeds`` and ``feasible_seeds`` of the curriculum.
+    """Return the comparisons of one measure, with ``seeds``, ``feasible_seeds`` and ``failed``.
+
+    The first two are of the curriculum, failed trials of both sides.
 
     Args:
         comparisons: of ``comparisons.comparisons``.
@@ -105,8 +107,12 @@ def compared_rows(comparisons: pd.DataFrame, summary: pd.DataFrame, measure: Mea
         measure: which of the three outcomes.
     """
     rows = comparisons[comparisons["measure"] == measure.value]
-    counts = summary[[*GROUP, "measure", "seeds", "feasible_seeds"]]
-    return rows.merge(counts, on=[*GROUP, "measure"], how="left", sort=False)
+    counts = summary[[*GROUP, "measure", "seeds", "feasible_seeds", "failed"]]
+    beside = counts.drop(columns=["seeds", "feasible_seeds"])
+    beside = beside.rename(columns={"method": "baseline", "failed": "baseline_failed"})
+    merged = rows.merge(counts, on=[*GROUP, "measure"], how="left", sort=False)
+    merged = merged.merge(beside, on=["task", "agent", "baseline", "measure"], how="left", sort=False)
+    return merged.assign(failed=merged["failed"] + merged["baseline_failed"])
 
 
 def comparison_table(rows: pd.DataFrame, suffixes: Sequence[str] = ()) -> pd.DataFrame:
@@ -124,9 +130,12 @@ def comparison_table(rows: pd.DataFrame, suffixes: Sequence[str] = ()) -> pd.Dat
     costs = [name for name in map(str, rows) if name.startswith("cost_") and name.endswith("_difference")]
     feasible = rows["feasible_pairs"] == rows["pairs"]
     any_tested = bool((feasible & rows["return_difference_p"].notna()).any())
+    any_failed = bool((rows["failed"] > 0).any())
     lines = []
     for _, row in rows.iterrows():
         line = names_of(row) | {"n": str(row["pairs"])}
+        if any_failed:
+            line["failed"] = str(row["failed"])
         no_gain = row["feasible_pairs"] < row["pairs"]
         line["feasible pairs"] = f"{row['feasible_pairs']} of {row['pairs']}"
         line["return gained"] = DASH if no_gain else with_interval(row, "return_difference")
@@ -149,8 +158,7 @@ def _cost_suffix(suffixes: Sequence[str], column: str, num_costs: int) -> str:
 def with_interval(row: pd.Series, name: str) -> str:
     """Format estimate [low, high] from the three columns of an interval; without ends if they are NaN."""
     estimate, low, high = (float(row[f"{name}{end}"]) for end in ("", "_low", "_high"))
-    ends = "" if math.isnan(low) else f" [{low:z.2f}, {high:z.2f}]"  # z: no -0.00
-    return DASH if math.isnan(estimate) else f"{estimate:z.2f}{ends}"
+    return number(estimate) + ("" if math.isnan(low) else f" [{number(low)}, {number(high)}]")
 
 
 def p_value(value: float) -> str:

@@ -112,7 +112,15 @@ def _product(rows: pd.DataFrame) -> str:
 
 
 def _best(rows: pd.DataFrame, column: str) -> str:
-    """Describe the best curricula, and ``none``, by their shares of the trials that have ended."""
+    """Describe the best curricula, and ``none``, by their shares of the trials that have ended.
+
+    Nothing is said if an agent has more such trials under one curriculum than under another, and there are
+    several agents: then a share would depend on which agents it has.
+    """
+    ended = rows.assign(ended=rows["planned"] - rows["pending"])
+    by_agent = ended.pivot_table("ended", "agent", "method", aggfunc="sum", fill_value=0, observed=True)
+    if len(by_agent) > 1 and (by_agent.nunique(axis=1) > 1).any():
+        return ""
     counts = _by_method(rows)
     counts = counts[counts["ended"] > 0]
     shares = counts[column] / counts["ended"]

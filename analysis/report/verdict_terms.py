@@ -52,6 +52,7 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
         *errors,
         *([solved] if any_known else []),
         tolerance_sentence(verdicts, exact=all_exact(verdicts)),
+        *_only_by_error(verdicts),
         *([above] if any_known else []),
         *([failed] if verdicts["failed"].any() else []),
         *([pending] if verdicts["pending"].any() else []),
@@ -60,6 +61,17 @@ def explanation(verdicts: pd.DataFrame) -> list[str]:
         *([intervals] if intervals else []),
         f"The {DEPLOYMENT} averages many policies. It never enters a verdict.",
         *(sentence for flag, (_, sentence) in WARNINGS.items() if verdicts[flag].any()),
+    ]
+
+
+def _only_by_error(verdicts: pd.DataFrame) -> list[str]:
+    """Say how many policies are feasible only because of the standard errors of their costs."""
+    count, feasible = int(verdicts["feasible_by_error"].sum()), int(verdicts["feasible"].sum())
+    if not count:
+        return []
+    return [
+        f"Feasible only because of a standard error: {count} of {feasible}. Their mean cost is more than "
+        f"{COST_TOLERANCE:.0%} above a limit; more evaluation episodes would tell."
     ]
 
 

@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import ndtri, stdtr, stdtrit  # importing scipy.stats takes a second and a half
@@ -192,12 +192,17 @@ def improvement_interval(
         generator: draws the resamples.
         tie: values at most this far apart count as equal, at least 0.
         replications: r, number of resamples.
+
+    Returns:
+        The interval. Its ends are NaN where they are equal, which says nothing of the uncertainty. This is so
+        where every run of one is better than every run of the other, or all are equal.
     """
     replicated = probability_of_improvement(
         _resampled(scores, generator, replications), _resampled(others, generator, replications), tie=tie
     )
     estimate = float(probability_of_improvement(scores, others, tie=tie))
-    return _percentile_interval(estimate, replicated, min(len(scores), len(others)), CONFIDENCE)
+    found = _percentile_interval(estimate, replicated, min(len(scores), len(others)), CONFIDENCE)
+    return replace(found, low=math.nan, high=math.nan) if found.low == found.high else found
 
 
 def paired_difference(values: Floats, baseline: Floats, *, tie: float = 0.0) -> Difference:

@@ -15,7 +15,7 @@ import pandas as pd
 
 from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.statistics.metrics import Measure
-from recrl.analysis.statistics.verdicts import exceeded_costs, is_cost
+from recrl.analysis.statistics.verdicts import exceeded_costs, is_cost, within_limits
 from recrl.orchestrator.files.outcomes_file import VERDICT_MEASURE
 from recrl.orchestrator.spec import TrialStatus
 
@@ -40,6 +40,7 @@ def count_verdicts(
 
     Returns:
         GROUP, seeds (evaluated final policies), solved, feasible (the solved ones included), infeasible;
+        feasible_by_error (feasible policies with a cost that only its standard error allows);
         planned (all trials), failed, pending (neither complete nor failed: they wait, run or are damaged);
         exceeded_i (evaluated final policies that exceed limit i), excess_i_low and excess_i_high (least and
         largest excess among them, NaN if there are none); cost_name_i, only if a task has several costs
@@ -86,9 +87,14 @@ def count_verdicts(
 
 
 def _counts(seeds: pd.DataFrame) -> dict[str, int]:
-    counts = {"solved": seeds["optimal"].sum(), "feasible": seeds["feasible"].sum()}
-    infeasible = len(seeds) - counts["feasible"]
-    return {"seeds": len(seeds)} | {k: int(v) for k, v in (counts | {"infeasible": infeasible}).items()}
+    feasible, without_errors = seeds["feasible"], seeds.filter(regex=r"^(?!cost_\d+_se$)")
+    counts = {
+        "solved": seeds["optimal"].sum(),
+        "feasible": feasible.sum(),
+        "infeasible": len(seeds) - feasible.sum(),
+        "feasible_by_error": (feasible & ~within_limits(without_errors)).sum(),
+    }
+    return {"seeds": len(seeds)} | {name: int(count) for name, count in counts.items()}
 
 
 def _states(status: pd.Series[str]) -> dict[str, int]:

@@ -145,6 +145,12 @@ def test_bootstrap_says_when_runs_are_too_few() -> None:
     assert math.isnan(alone.low)
 
 
+def test_a_bootstrap_that_knows_no_other_order_gives_no_interval() -> None:
+    apart = improvement_interval(np.array([[3.0], [4.0]]), np.array([[1.0], [2.0]]), generator())
+    assert apart.estimate == 1.0
+    assert np.isnan([apart.low, apart.high]).all()  # a width of 0 would say that it is certain
+
+
 def test_equal_generators_give_equal_intervals() -> None:
     first = improvement_interval(SCORES, OTHERS, generator())
     assert first == improvement_interval(SCORES, OTHERS, generator())

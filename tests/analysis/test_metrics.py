@@ -14,6 +14,7 @@ from recrl.analysis.data.labels import KEY
 from recrl.analysis.data.sweep_data import Sweep
 from recrl.analysis.report import table_formats
 from recrl.analysis.statistics import metrics, verdicts
+from recrl.analysis.statistics.comparisons import comparisons
 from recrl.orchestrator.files.sweep_store import SweepStore
 from tests.analysis.rows import only
 
@@ -191,6 +192,13 @@ def test_failed_trials_are_in_the_fractions_and_in_no_mean(finished: Sweep) -> N
     assert shown["failed"].to_dict() == {"none": "0", "linear": "2", "dynamic": "3"}
     assert shown["feasible"].to_dict() == {"none": "3 of 3", "linear": "1 of 3", "dynamic": "0 of 3"}
     assert shown["return"]["dynamic"] == "–"
+    rows = metrics.outcomes(dataclasses.replace(finished, trials=trials))
+    compared = comparisons(rows, np.random.default_rng(0))
+    pairs = table_formats.compared_rows(compared, summary, metrics.Measure.STOCHASTIC)
+    row = only(pairs, task="river-a", agent="cpo", method="linear")
+    assert (row["pairs"], row["failed"]) == (1, 2)
+    assert "failed" in table_formats.comparison_table(pairs)
+    assert "failed" not in table_formats.comparison_table(pairs.assign(failed=0))
 
 
 def test_interquartile_means_carry_their_warning(finished: Sweep) -> None:

@@ -191,6 +191,8 @@ def test_a_small_number_has_two_digits_and_none_is_a_minus_zero(value: float, te
 def test_means_and_intervals_have_no_minus_zero() -> None:
     assert with_error(-0.004, 0.012) == "0.00 ± 0.01"
     row = pd.Series({"gain": -0.001, "gain_low": -0.004, "gain_high": 0.002})
+    assert table_formats.with_interval(row, "gain") == "-0.001 [-0.004, 0.002]"
+    row = pd.Series({"gain": -0.0, "gain_low": -1e-13, "gain_high": 0.0})
     assert table_formats.with_interval(row, "gain") == "0.00 [0.00, 0.00]"
 
 

@@ -251,6 +251,30 @@ def test_the_best_curriculum_is_that_with_the_most_successes_of_all_its_trials()
     ]
 
 
+def test_no_curriculum_is_best_where_agents_have_unequal_numbers_of_trials() -> None:
+    """Under none ppo solves more; cpo, which solves less, has run under none only."""
+    rows = [outcome("none", seed, 9.5, 5.0, agent="ppo") for seed in range(5)]
+    rows += [outcome("linear", seed, 9.5, 5.0, agent="ppo") for seed in range(4)]
+    rows += [outcome("linear", 4, 9.6, 6.0, agent="ppo")]
+    rows += [outcome("none", seed, 9.6, 6.0) for seed in range(5)]
+    waiting = [outcome("linear", seed, 0.0, 0.0) for seed in range(5)]
+    assert "most often" not in " ".join(answers(judged(rows, waiting=waiting)))
+    assert "most often" in " ".join(answers(judged(rows[:10])))
+
+
+def test_policies_that_only_their_standard_error_makes_feasible_are_counted() -> None:
+    costs = ((5.0, 0.3), (5.2, 0.3), (5.04, 0.3), (5.6, 0.3))  # allowed without the error: 5.05
+    rows = [
+        outcome("none", seed, 9.0, cost, cost_0_se=error, feasible=cost <= 5.0 + error, exact=False)
+        for seed, (cost, error) in enumerate(costs)
+    ]
+    table = judged(rows)
+    assert table[["feasible", "feasible_by_error"]].to_numpy().tolist() == [[3, 1]]
+    said = " ".join(explanation(table))
+    assert "Feasible only because of a standard error: 1 of 3. Their mean cost is more than 1% above" in said
+    assert "standard error: " not in " ".join(explanation(judged(ROWS)))
+
+
 def test_a_curriculum_of_which_every_trial_failed_has_a_row() -> None:
     table = judged(ROWS[4:6], failed=FAILED[:3])
     assert table["method"].tolist() == ["dynamic", "none"]

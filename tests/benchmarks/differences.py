@@ -6,10 +6,10 @@
 
 Tables are those of ``final_policies.py``. With ``--control`` each group is the seeds of one agent on one
 task, and the groups are independent; a task without a control is left out. With one agent a task the last
-line averages the tasks' differences, with the variance within groups pooled. With ``--against`` the control
+line averages the tasks' differences. With ``--against`` the control
 is that curriculum in the same tables, and trials are paired by seed, or with ``--groups`` independent. With
 ``--limit`` only policies count whose mean cost is at most one standard error, over episodes, above it. The p
-values are corrected for all rows that are printed, by Holm's method.
+values are corrected for all rows of a table, by Holm's method.
 """
 
 from __future__ import annotations
@@ -75,17 +75,20 @@ def differences_from(
 
 
 def average(rows: pd.DataFrame, control: pd.DataFrame, column: str) -> str:
-    """The mean of the tasks' differences; the tasks are fixed, the seeds random."""
+    """The mean of the tasks' differences; the tasks are fixed, the seeds random.
+
+    The interval is Welch's for a sum of independent means, with Satterthwaite's degrees of freedom.
+    """
     pairs = [
         (group[column].to_numpy(), control.loc[control["task"] == task, column].to_numpy())
         for task, group in rows.groupby("task")
     ]
-    degrees = sum(len(each) - 1 for pair in pairs for each in pair)
-    variance = sum(((each - each.mean()) ** 2).sum() for pair in pairs for each in pair) / degrees
+    groups = [each for pair in pairs for each in pair]
+    parts = np.array([each.var(ddof=1) / len(each) for each in groups])
+    degrees = parts.sum() ** 2 / (parts**2 / np.array([len(each) - 1 for each in groups])).sum()
     mean = float(np.mean([values.mean() - base.mean() for values, base in pairs]))
-    error = math.sqrt(variance * sum(1.0 / len(each) for pair in pairs for each in pair)) / len(pairs)
-    reach = error * float(stats.t.ppf(0.5 + 0.5 * CONFIDENCE, degrees))
-    return f"{mean:.2f} ({mean - reach:.2f} to {mean + reach:.2f}; {degrees} degrees of freedom)"
+    reach = math.sqrt(parts.sum()) / len(pairs) * float(stats.t.ppf(0.5 + 0.5 * CONFIDENCE, degrees))
+    return f"{mean:.2f} ({mean - reach:.2f} to {mean + reach:.2f}; {degrees:.1f} degrees of freedom)"
 
 
 def main() -> None:

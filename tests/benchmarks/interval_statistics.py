@@ -12,10 +12,12 @@ from __future__ import annotations
 import argparse
 import importlib
 import importlib.util
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtri
 
 from recrl.analysis.statistics.intervals import (
     Interval,
@@ -67,6 +69,12 @@ def intervals(generator: np.random.Generator) -> dict[str, tuple[Callable[[int],
             lambda n, scale=ratio: group_difference(scale * row(n), row(n)),  # type: ignore[misc]
             0.0,
         )
+    for share in SHARES[1:]:
+        shift = 2.0**0.5 * float(ndtri(share))
+        made[f"improvement of {share}"] = (
+            lambda n, by=shift: improvement_interval(table(n) + by, table(n), generator),  # type: ignore[misc]
+            share,
+        )
     return made
 
 
@@ -96,11 +104,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     generator = np.random.default_rng(0)
     print(f"{'95% intervals that hold the truth':36}" + "".join(f"{f'n = {runs}':>8}" for runs in RUNS))
     for name, (make, truth) in intervals(generator).items():
-        shares = []
+        shares, without = [], []
         for runs in RUNS:
-            drawn = (make(runs) for _ in range(samples))
-            shares.append(sum(it.low <= truth <= it.high for it in drawn) / samples)
+            drawn = [make(runs) for _ in range(samples)]
+            missing = sum(math.isnan(it.low) for it in drawn)
+            shares.append(sum(it.low <= truth <= it.high for it in drawn) / (samples - missing))
+            without.append(missing / samples)
         print(f"{name:36}" + "".join(f"{share:8.3f}" for share in shares), flush=True)
+        if any(without):
+            print(f"{'  without an interval':36}" + "".join(f"{share:8.3f}" for share in without), flush=True)
     if importlib.util.find_spec("rliable"):
         for name, difference in differences_to_rliable(generator).items():
             print(f"largest difference to rliable's {name}: {difference:.1e}")

@@ -200,9 +200,16 @@ def claims(rows: pd.DataFrame) -> Iterator[str]:
 
 
 def seeds_in_which(claim: pd.DataFrame, measure: str) -> str:
-    """Return in how many seeds a claim holds, for each row, by the final policies or ``deployment_``."""
-    counts = claim[[f"{measure}held", f"{measure}seeds"]].to_numpy()
-    return ", ".join(f"{held} of {seeds}" for held, seeds in counts)
+    """Return in how many seeds a claim holds, for each row, by the final policies or ``deployment_``.
+
+    If it compares returns, the number of pairs whose two policies keep the limit follows where it is not all.
+    """
+    texts = []
+    for _, row in claim.iterrows():
+        held, seeds, feasible = (row[f"{measure}{name}"] for name in ("held", "seeds", "feasible_pairs"))
+        few = "" if pd.isna(feasible) or feasible == seeds else f" ({feasible:.0f})"
+        texts.append(f"{held} of {seeds}{few}")
+    return ", ".join(texts)
 
 
 def tables() -> Iterator[tuple[Path, str, list[str]]]:

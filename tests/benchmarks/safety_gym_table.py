@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 from PIL import Image
 from scipy.stats import fisher_exact
@@ -151,8 +152,24 @@ def limit_counts(rows: pd.DataFrame, policy: str) -> Iterator[str]:
             both = of_agent.merge(seeds, on=["task", "seed"])  # cosine and exponential have fresh seeds only
             groups = [both.loc[both["method"] == it, "exceeds"] for it in (method, "none")]
             yield f"  {method} and none: {fisher(*groups)}"
-    by_agent = [exceeds.loc[exceeds["agent"] == name, "exceeds"] for name in ("cpo", "ppo-lag")]
-    yield f"{policy}, cpo and ppo-lag: {fisher(*by_agent)}"
+    cells = exceeds.pivot_table("exceeds", ["task", "seed"], "agent", aggfunc="sum").astype(int)
+    p = sign_flips((cells["cpo"] - cells["ppo-lag"]).to_numpy())
+    yield (
+        f"{policy}, cpo and ppo-lag: {cells['cpo'].sum()} and {cells['ppo-lag'].sum()} exceed the limit; "
+        f"by task and seed, {len(cells)} pairs of counts, sign flips, p = {p:.2g}"
+    )
+
+
+def sign_flips(differences: npt.NDArray[np.int_]) -> float:
+    """Return the exact p value of a mean of 0, if each difference is as likely to have the other sign.
+
+    >>> sign_flips(np.array([1, 2, 3]))
+    0.25
+    """
+    totals = np.zeros(1, np.int_)
+    for each in differences:
+        totals = np.concatenate([totals + each, totals - each])
+    return float(np.mean(np.abs(totals) >= abs(differences.sum())))
 
 
 def fisher(first: pd.Series[bool], second: pd.Series[bool]) -> str:

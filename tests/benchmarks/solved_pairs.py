@@ -66,7 +66,7 @@ def mcnemar(first: str, second: str, only_first: int, only_second: int) -> str:
 
 
 def kinds_of_policy(rows: pd.DataFrame) -> Iterator[str]:
-    """Yield how many trials only the average, or only the last policy, solves, a line an agent.
+    """Yield how many trials, or more trials of a seed, only the average or only the last policy solves.
 
     Args:
         rows: of ``judged``.
@@ -77,6 +77,9 @@ def kinds_of_policy(rows: pd.DataFrame) -> Iterator[str]:
         average, last = trials["average"], trials["last"]
         counts = int((average & ~last).sum()), int((last & ~average).sum())
         yield f"{agent}: {mcnemar('average', 'last', *counts)}"
+        by_seed = (average.astype(int) - last.astype(int)).groupby("seed").sum()
+        more = int((by_seed > 0).sum()), int((by_seed < 0).sum())
+        yield f"{agent}, seeds with which one solves more: {mcnemar('average', 'last', *more)}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
