@@ -52,7 +52,7 @@ cluster-test: install
 # moto wants a newer graphql-core than MLflow: it stays beside the environment
 s3-test: install
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt s3fs
-	$(BIN)/pip install --quiet --disable-pip-version-check --target .venv/moto 'moto[server]'
+	$(BIN)/pip install --quiet --disable-pip-version-check --target .venv/moto 'moto[server]==5.2.5'
 	PYTHONPATH=.venv/moto $(BIN)/python -c 'import s3fs, moto.server'  # without them the tests are skipped
 	PYTHONPATH=.venv/moto $(BIN)/python -m pytest -q tests/orchestrator/test_s3.py
 
@@ -60,4 +60,4 @@ storage-test: s3-test
 	PYTHONPATH=.venv/moto $(BIN)/python -m tests.faults.cluster_storage --log results/cluster/storage.txt
 
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist src/*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -19,6 +19,7 @@ from recrl.orchestrator.errors import ClusterError, RecrlError, first_line
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.provenance.own_package import copy_package
 from recrl.orchestrator.ray.private_api import (
+    RANGE,
     at_loopback,
     fewer_processes,
     own_sessions,
@@ -35,6 +36,7 @@ CONNECT_SECONDS = 5.0
 CONNECT_TRIES = 3
 OBJECT_STORE_BYTES = 80 * 2**20  # Ray requires 75 MiB at least; recrl stores nothing of that size
 ADDRESS_VARIABLE = "RAY_ADDRESS"
+MODE_VARIABLE = "RAY_AUTH_MODE"
 TOKEN_VARIABLE = "RAY_AUTH_TOKEN_PATH"
 TOKEN = "token"  # in the cluster's folder
 PREFIX = "recrl-ray-"  # only the next cluster removes such a folder: it ends the processes first
@@ -96,7 +98,7 @@ def local_cluster(num_cpus: int) -> Iterator[Path]:
             file.write(_token())
         seldom = {f"RAY_{name}": str(value) for name, value in SELDOM.items()}
         with environment(QUIET | WORKER | seldom | {TOKEN_VARIABLE: str(token_path)}):
-            for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", ADDRESS_VARIABLE):
+            for name in (MODE_VARIABLE, "RAY_AUTH_TOKEN", ADDRESS_VARIABLE):
                 os.environ.pop(name, None)  # Ray uses the mode only if it is set before Ray starts
             with (
                 _leaving_no_process(folder),
@@ -112,6 +114,11 @@ def local_cluster(num_cpus: int) -> Iterator[Path]:
                     _temp_dir=str(folder / RAY_FOLDER),
                 ),
             ):
+                if os.environ.get(MODE_VARIABLE) != "token":
+                    raise ClusterError(
+                        f"Ray {ray.__version__} started without a token, so other users could "
+                        f"use it; install a version that requires one: pip install '{RANGE}'"
+                    )
                 yield folder
 
 

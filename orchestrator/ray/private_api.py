@@ -19,7 +19,7 @@ import ray
 from recrl.orchestrator.errors import ClusterError
 
 NEWEST = (2, 60)  # version of Ray that these names were checked with
-RANGE = "ray[tune]>=2.48,<2.61"
+RANGE = "ray[tune]>=2.59,<2.61"
 NAMES = (
     "parameter.RayParams",
     "ray_constants.ENABLE_RAY_CLUSTER",

@@ -1,6 +1,7 @@
 """The private names of Ray are there, and one that is missing is a sentence that says what to install."""
 
 import tomllib
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +10,7 @@ import pytest
 import ray
 
 from recrl.orchestrator.errors import ClusterError
-from recrl.orchestrator.ray import private_api
+from recrl.orchestrator.ray import clusters, private_api
 
 WHAT_TO_DO = """\
 Ray has changed a private name that recrl uses. In orchestrator/ray/private_api.py, for each name:
@@ -48,8 +49,17 @@ def test_a_missing_name_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
         private_api.require_known_ray()
     assert str(caught.value) == (
         f"Ray {ray.__version__} has no ray._private.services.ConsolePopen, which recrl uses; install a "
-        "version that it was tested with: pip install 'ray[tune]>=2.48,<2.61'"
+        "version that it was tested with: pip install 'ray[tune]>=2.59,<2.61'"
     )
+
+
+def test_a_ray_that_starts_without_a_token_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clusters, "_connection", lambda *_, **__: nullcontext())
+    with (
+        pytest.raises(ClusterError, match=r"started without a token, .*: pip install 'ray\[tune\]>=2\.59"),
+        clusters.local_cluster(num_cpus=1),
+    ):
+        pass
 
 
 def test_a_newer_ray_is_used_with_a_warning(
@@ -59,7 +69,7 @@ def test_a_newer_ray_is_used_with_a_warning(
     assert caplog.messages == []
     monkeypatch.setattr(ray, "__version__", "2.61.0")
     private_api.require_known_ray()
-    assert caplog.messages == ["Ray 2.61.0 is newer than the tested versions: ray[tune]>=2.48,<2.61"]
+    assert caplog.messages == ["Ray 2.61.0 is newer than the tested versions: ray[tune]>=2.59,<2.61"]
 
 
 @pytest.mark.parametrize(
