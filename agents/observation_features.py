@@ -238,11 +238,14 @@ class ProximityObservation(gymnasium.ObservationWrapper[Any, Any, Any]):
             space.shape[0], components or (), scales=scales, normalise=np.zeros(space.shape[0], np.bool_)
         )
         added = self._encoder.size - space.shape[0]
+        low, high = space.low.astype(np.float32), space.high.astype(np.float32)
         self.observation_space = Box(
-            np.concatenate([space.low, np.zeros(added, np.float32)]),
-            np.concatenate([space.high, np.ones(added, np.float32)]),
-            dtype=np.float32,
+            np.concatenate([low, np.zeros(added, np.float32)]),
+            np.concatenate([high, np.ones(added, np.float32)]),
         )
+        # Without a lidar, so that agents of this package do not add the features again.
+        plain = (ObservationComponent(part.name, part.size) for part in components or ())
+        self.observation_components = (*plain, ObservationComponent("proximity", added))
 
     def observation(self, observation: Any) -> Rows:
         """Add the proximity features, [n] -> [n + S L]."""

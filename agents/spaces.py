@@ -107,7 +107,7 @@ def environment_actions(space: gymnasium.Space[Any], actions: npt.NDArray[Any]) 
     actions, whose density is known.
     """
     if isinstance(space, Discrete):
-        shifted: npt.NDArray[np.int64] = actions + space.start
+        shifted: npt.NDArray[Any] = (actions + space.start).astype(space.dtype, copy=False)
         return shifted
     assert isinstance(space, Box)
     if actions.shape[1:] != (math.prod(space.shape),):

@@ -69,7 +69,7 @@ class ContinuousBanditVectorEnv(CMDPVectorEnv):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Start B episodes, or those of a ``reset_mask`` (``recrl.environments.vector``)."""
-        chosen = masked_environments(self.cmdp.name, self.num_envs, options)
+        chosen = masked_environments(self.cmdp, self.num_envs, options, has_begun=self._elapsed is not None)
         super().reset(seed=seed, options=options)
         if chosen is not None:
             return self.restart(chosen), {}
@@ -94,7 +94,7 @@ class ContinuousBanditVectorEnv(CMDPVectorEnv):
         self._elapsed[truncated] = 0
         info: dict[str, Any] = {"cost": pull**2}
         if truncated.any():
-            info["final_obs"] = self._observations()
+            info["final_obs"], info["_final_obs"] = self._observations(), truncated.copy()
         rewards: Floats = 1.0 - (1.0 - pull[:, 0]) ** 2
         return self._observations(), rewards, np.zeros(self.num_envs, np.bool_), truncated, info
 

@@ -7,7 +7,7 @@ reset. Here it stays.
 Requirements for a scalar environment:
 
 - It reports ``info["cost"]``, a number or k numbers, at every step.
-- Its action space is ``Discrete`` or a floating-point ``Box``, bounded or not.
+- Its action space is ``Discrete`` from 0, or a floating-point ``Box`` of one dimension, bounded or not.
 - It is a function of its seed and its actions: ``reset(seed=...)`` determines an episode.
 
 An environment may name its costs in an attribute ``cost_names``. Its horizon, for the agents' defaults, is
@@ -110,14 +110,16 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
             self.single_action_space,
             names_of_costs(name, first, cost_names),
             _declared_horizon(first),
-            _declared_components(first),
+            _declared_components(name, first),
         )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Start B episodes; ``seed`` restarts the generator from which episode seeds are drawn."""
-        masked = masked_environments(self.cmdp.name, self.num_envs, options)
+        masked = masked_environments(
+            self.cmdp, self.num_envs, options, has_begun=self._observations is not None
+        )
         super().reset(seed=seed)
         if masked is not None:
             return self.restart(masked), {}
@@ -147,7 +149,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         info: dict[str, Any] = {"cost": costs}
         self._observations = last_observations
         if (terminated | truncated).any():
-            info["final_obs"] = last_observations
+            info["final_obs"], info["_final_obs"] = last_observations, terminated | truncated
             self._observations = last_observations.copy()
             for index in np.flatnonzero(terminated | truncated).tolist():
                 self._observations[index] = self._start_episode(index)
@@ -200,6 +202,9 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         space = self.single_action_space
         seeds = saved.whole_numbers("episode_seeds", self.num_envs, most=SEED_BOUND - 1)
         actions = saved.arrays("episode_actions", self.num_envs, shape=space.shape or (), dtype=space.dtype)
+        for index, taken in enumerate(actions):
+            if not _lie_in(space, taken):
+                raise saved.error(f"episode_actions.{index}", f"must lie in {space}")
         if "checksums" in state:
             saved.check_number("checksums", self.num_envs)
         expected = state.get("checksums")
@@ -284,7 +289,7 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         """Raise an error that names the task; otherwise the policy would fail later."""
         if not np.isfinite(observations).all():
             bad = observations[~np.isfinite(observations).all(axis=-1)][0]
-            raise ValueError(f"{self.cmdp.name}: an observation must be finite, got {_brief(bad)}")
+            raise ValueError(f"{self.cmdp.name}: an observation must be finite in float32, got {_brief(bad)}")
         if rewards is not None and not np.isfinite(rewards).all():
             bad = rewards[~np.isfinite(rewards)][0]
             raise ValueError(f"{self.cmdp.name}: a reward must be finite, got {bad:g}")
@@ -294,7 +299,8 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         try:
             # NumPy would convert None to NaN.
             if observation is not None and (not self._integers_lie_in or self._integers_lie_in(observation)):
-                flat = np.asarray(self._flatten(observation), np.float32)
+                with np.errstate(over="ignore"):  # then it is not finite
+                    flat = np.asarray(self._flatten(observation), np.float32)
                 if flat.shape == self.single_observation_space.shape:
                     return flat
         except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
@@ -311,13 +317,13 @@ class SyncCMDPVectorEnv(CMDPVectorEnv):
         if actions.shape != expected:
             raise ValueError(f"{self.cmdp.name}: actions must have shape {expected}, got {actions.shape}")
         if isinstance(space, spaces.Box):
-            if not np.isfinite(actions).all():
-                raise ValueError(f"{self.cmdp.name}: actions must be finite, got {actions.tolist()}")
+            if actions.dtype.kind not in "fiu" or not np.isfinite(actions).all():
+                raise ValueError(f"{self.cmdp.name}: actions must be finite numbers, got {actions.tolist()}")
             clipped: npt.NDArray[Any] = np.clip(actions, space.low, space.high).astype(space.dtype)
             return clipped
-        if actions.dtype.kind not in "iu" or not all(map(space.contains, actions)):
+        if actions.dtype.kind not in "iu" or not _lie_in(space, actions):
             raise ValueError(f"{self.cmdp.name}: actions must lie in {space}, got {actions.tolist()}")
-        return actions.astype(np.int64)
+        return actions.astype(space.dtype)
 
     def _reported_costs(self, info: dict[str, Any]) -> Floats:
         if self._costless:
@@ -416,27 +422,36 @@ def _time_limits(environment: Environment) -> Iterator[int]:
         environment = environment.env
 
 
-def _declared_components(environment: Environment) -> tuple[ObservationComponent, ...]:
+def _declared_components(name: str, environment: Environment) -> tuple[ObservationComponent, ...]:
     """Return the declared slices of an environment's flattened observation, or none."""
     if not environment.has_wrapper_attr("observation_components"):
         return ()
-    components = tuple(environment.get_wrapper_attr("observation_components"))
+    declared = environment.get_wrapper_attr("observation_components")
+    components = tuple(declared) if isinstance(declared, Sequence) else (declared,)
     for component in components:
         if not isinstance(component, ObservationComponent):
             raise ValueError(
-                "observation_components must hold recrl.environments.cmdp.ObservationComponent, got "
+                f"{name}: observation_components must hold recrl.environments.cmdp.ObservationComponent, got "
                 f"{_brief(component)}"
             )
-    declared = sum(component.size for component in components)
+    described = sum(component.size for component in components)
     size = spaces.flatdim(environment.observation_space) if components else 0
     inner = environment.unwrapped
-    if declared != size and inner is not environment and hasattr(inner, "observation_components"):
+    if described != size and inner is not environment and hasattr(inner, "observation_components"):
         raise ValueError(
-            f"the environment's observation_components describe {declared} numbers, and its wrappers give "
-            f"{size}; let the wrapper that changes the observation have observation_components of its own, "
-            "or () for none"
+            f"{name}: the environment's observation_components describe {described} numbers, and its "
+            f"wrappers give {size}; let the wrapper that changes the observation have observation_components "
+            "of its own, or () for none"
         )
     return components
+
+
+def _lie_in(space: spaces.Space[Any], actions: npt.NDArray[Any]) -> bool:
+    """Whether all actions are within the bounds of a space, whatever their type of number."""
+    if isinstance(space, spaces.Box):
+        return bool(((space.low <= actions) & (actions <= space.high)).all())
+    assert isinstance(space, spaces.Discrete)
+    return bool(((space.start <= actions) & (actions < space.start + space.n)).all())
 
 
 def made_environment(name: str, factory: Callable[[], Environment]) -> Environment:

@@ -163,7 +163,7 @@ class CostArrays(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Take a step; convert its costs."""
         observation, reward, terminated, truncated, info = super().step(action)
-        costs = {"cost": np.asarray(info["cost"], np.float64).reshape(-1)} if "cost" in info else {}
+        costs = {"cost": np.array(info["cost"], np.float64).reshape(-1)} if "cost" in info else {}
         return observation, reward, terminated, truncated, {**info, **costs}
 
 

@@ -7,7 +7,7 @@ Agents see every task as a ``CMDPVectorEnv``. Its contract:
     - ``info["cost"]`` is float64 [B, k], the step's costs in the order of ``cmdp.cost_names``;
     - ``info["final_obs"]`` [B, ...] holds the true last observation in the rows where an episode
       ended (elsewhere its content means nothing); it is present only if one ended;
-    - ``info["_final_obs"]``, bool [B], marks these rows; MuJoCo tasks have it.
+    - ``info["_final_obs"]``, bool [B], marks these rows, and is present with it.
 - An environment whose episode ended is reset in the same step (Gymnasium's ``SAME_STEP``). Row i of
   the returned observations is then the first one of the next episode.
 - All other entries of ``info`` belong to the step, not to the reset, and have every row. So Gymnasium's
@@ -36,19 +36,22 @@ from recrl.environments.cmdp import CMDPSpec
 
 
 def masked_environments(
-    name: str, num_envs: int, options: Mapping[str, Any] | None
+    cmdp: CMDPSpec, num_envs: int, options: Mapping[str, Any] | None, *, has_begun: bool
 ) -> npt.NDArray[np.intp] | None:
     """Return the environments to reset, [M], by the options of ``reset``; None if they name none.
 
     Args:
-        name: of the task, for errors.
+        cmdp: of the task, for errors.
         num_envs: B.
         options: of ``reset``. As in Gymnasium, ``reset_mask`` is bool [B], with at least one True.
+        has_begun: whether ``reset`` was called before.
 
     Raises:
         TypeError: the mask is no array of booleans.
-        ValueError: it has a wrong shape or chooses no environment, or there are other options.
+        ValueError: it has a wrong shape or chooses no environment, there are other options, or the first
+            reset has a mask.
     """
+    name = cmdp.name
     if not options:
         return None
     if others := sorted(map(str, options.keys() - {"reset_mask"})):
@@ -61,6 +64,8 @@ def masked_environments(
         raise ValueError(
             f"{name}: reset_mask must have shape ({num_envs},) and at least one True, got {mask.tolist()}"
         )
+    if not has_begun:
+        raise ValueError(f"{name}: call reset without a reset_mask first")
     return np.flatnonzero(mask)
 
 

@@ -175,7 +175,7 @@ class FiniteVectorEnv(CMDPVectorEnv):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
         """Start B episodes; ``seed`` restarts the generator that they share."""
-        masked = masked_environments(self.cmdp.name, self.num_envs, options)
+        masked = masked_environments(self.cmdp, self.num_envs, options, has_begun=self._elapsed is not None)
         super().reset(seed=seed)
         if masked is not None:
             return self.restart(masked), {}
@@ -197,7 +197,7 @@ class FiniteVectorEnv(CMDPVectorEnv):
         info: dict[str, Any] = {"cost": self._costs[pairs]}
         finished = terminated | truncated
         if finished.any():
-            info["final_obs"] = self.observations[states]
+            info["final_obs"], info["_final_obs"] = self.observations[states], finished
             states[finished] = self._first_states(int(np.count_nonzero(finished)))
             self._elapsed[finished] = 0
         self.states = states

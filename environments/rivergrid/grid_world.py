@@ -206,7 +206,7 @@ class RiverGridVectorEnv(FiniteVectorEnv):
         river_map: the map.
     """
 
-    render_mode = "rgb_array"
+    render_mode: str | None = "rgb_array"
     metadata: dict[str, Any] = {  # noqa: RUF012
         **FiniteVectorEnv.metadata,
         "render_modes": ["rgb_array"],
@@ -219,8 +219,14 @@ class RiverGridVectorEnv(FiniteVectorEnv):
         super().__init__(name, model, observations, num_envs=num_envs)
         self.river_map = river_map
 
-    def render(self) -> tuple[npt.NDArray[np.uint8], ...]:
-        """Render one RGB frame per environment, uint8 [height * 32, width * 32, 3], with MiniGrid."""
+    def render(self) -> tuple[npt.NDArray[np.uint8], ...] | None:
+        """Render one RGB frame per environment, uint8 [height * 32, width * 32, 3], with MiniGrid.
+
+        Returns:
+            The frames; None if ``render_mode`` is None.
+        """
+        if self.render_mode is None:
+            return None
         if not self.has_begun:
             raise ValueError(f"{self.cmdp.name}: call reset before the first frame")
         # MiniGrid takes long to import
@@ -264,7 +270,9 @@ def vector_of_task(
     """
     if render_mode not in (None, "rgb_array"):
         raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
-    return make_river_grid(task, num_envs, valid_options(task, options))
+    environment = make_river_grid(task, num_envs, valid_options(task, options))
+    environment.render_mode = render_mode
+    return environment
 
 
 def river_grid_optimum(name: str, options: RiverGridOptions, limits: CostLimits) -> float:

@@ -55,6 +55,9 @@ class RiverGridEnv(MiniGridEnv):
     """
 
     def __init__(self, task: str = "rivergrid-1a", render_mode: str | None = None, **options: Any) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            known = ", ".join(map(repr, self.metadata["render_modes"]))
+            raise ValueError(f"render_mode must be None, {known}, got {render_mode!r}")
         self.options = valid_options(task, options)
         self.river_map = task_map(task, self.options)
         self.cost_names = self.options.costs

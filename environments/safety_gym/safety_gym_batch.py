@@ -130,6 +130,7 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
         self.qvel = self.simulations.state(state.mjSTATE_QVEL, (model.nv,))
         self.mocap_pos = self.simulations.state(state.mjSTATE_MOCAP_POS, (model.nmocap, 3))
         self._controls = self.simulations.state(state.mjSTATE_CTRL, (model.nu,))
+        self._action = np.zeros((number, model.nu))  # of the next step; not yet checked
         self._bodies = self._views_of_gremlins() if task.gremlins.number else None
         self._memory = memory = allocate(self.scene, number)
         physics = self._views_of_physics()
@@ -216,7 +217,6 @@ class SafetyGymBatch(EnvironmentBatch[SafetyTask, SafetyGymOutcome]):
     def _view_records(self) -> None:
         """Name the parts of the environments' records, cut to the sizes of this task."""
         records, task = self._memory.environments, self.task
-        self._action: Floats = records["action"]
         self.points: Floats = records["points"][:, : max(places.stop for places in self.group.values())]
         distances = 2 if task.goal == "Push" else 1
         self.distances: Floats = records["distances"][:, :distances]

@@ -83,7 +83,7 @@ def observation_components(task: SafetyTask) -> tuple[ObservationComponent, ...]
 
 def _info(terms: tuple[str, ...], cost: str, outcome: SafetyGymOutcome) -> dict[str, Any]:
     info: dict[str, Any] = {term: outcome.terms[row] for row, term in enumerate(terms)}
-    info["cost"] = (outcome.terms if cost == "per_hazard" else outcome.costs).T
+    info["cost"] = (outcome.terms.copy() if cost == "per_hazard" else outcome.costs).T
     info["goal_met"] = outcome.goal_met
     if outcome.broken is not None:
         info["cost_exception"] = outcome.broken.astype(np.float64)

@@ -49,7 +49,6 @@ TASK = np.dtype(
         ("last_body", np.int64, (len(KINDS),)),
         ("lidar", np.int64, (len(KINDS),)),  # offset of each kind in an observation, -1 for none
         ("sensors", np.int64, (len(SENSORS),)),  # their offsets in an observation, -1 for none
-        ("observed", np.int64),  # size of an observation
         ("terms", np.int64, (MAX_TERMS,)),  # cost terms: indices of TERMS
         ("num_terms", np.int64),
         ("horizon", np.int64),
@@ -78,7 +77,6 @@ TASK = np.dtype(
 
 ENVIRONMENT = np.dtype(
     [
-        ("action", np.float64, (2,)),
         ("steps", np.int64),
         ("points", np.float64, (MAX_POINTS, 2)),  # (x, y) of what the lidar sees, metres
         ("distances", np.float64, (2,)),  # distances before the step, for the reward, metres

@@ -120,7 +120,7 @@ def _describe_task(one: Any, scene: Scene) -> None:
         one["first_body"][index], one["last_body"][index] = bodies.start, bodies.stop
         one["lidar"][index] = starts.get(f"{kind}_lidar", -1)
     one["sensors"] = [starts.get(name, -1) for name in SENSORS]
-    one["observed"], one["num_terms"] = task.observation_size, len(task.cost_terms)
+    one["num_terms"] = len(task.cost_terms)
     one["terms"][: len(task.cost_terms)] = [TERMS.index(term) for term in task.cost_terms]
     one["is_push"], one["is_button"] = task.goal == "Push", task.goal == "Button"
     one["goal_size"], one["goal_height"] = task.target.size, GOAL_HEIGHT

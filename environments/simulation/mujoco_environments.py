@@ -179,9 +179,8 @@ class MujocoVectorEnv(CMDPVectorEnv):
             TypeError: the mask is no array of booleans.
             ValueError: it is invalid, there are other options, or the first reset has a mask.
         """
-        chosen = masked_environments(self.cmdp.name, self.num_envs, options)
-        if chosen is not None and not self.batch.generators:
-            raise ValueError(f"{self.cmdp.name}: call reset without a reset_mask first")
+        has_begun = bool(self.batch.generators)
+        chosen = masked_environments(self.cmdp, self.num_envs, options, has_begun=has_begun)
         super().reset(seed=seed, options=options)
         if seed is not None or not self.batch.generators:
             self.batch.seed(seed, chosen)

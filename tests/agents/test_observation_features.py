@@ -1,6 +1,7 @@
 """What networks see of an observation."""
 
 import math
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -10,6 +11,7 @@ from gymnasium.spaces import Box
 from recrl.agents.observation_features import Encoder, ProximityObservation, RunningMoments
 from recrl.agents.registry import make_agent
 from recrl.environments.cmdp import CMDPSpec, ObservationComponent
+from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
 from recrl.environments.registry import make_vector
 from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 
@@ -109,6 +111,17 @@ def test_the_wrapper_gives_other_libraries_agents_the_same_numbers() -> None:
 def test_the_wrapper_refuses_observations_in_which_nothing_is_a_lidar() -> None:
     with pytest.raises(ValueError, match="with a declared lidar"):
         ProximityObservation(gymnasium.make("CartPole-v1"))
+
+
+def test_a_wrapped_environment_is_a_task_to_which_nothing_more_is_added() -> None:
+    def wrapped() -> gymnasium.Env[Any, Any]:
+        return ProximityObservation(gymnasium.make("recrl.environments.registration:recrl/CarGoal2-v0"))
+
+    environments = SyncCMDPVectorEnv("wrapped", [wrapped])
+    parts = environments.cmdp.components
+    assert sum(part.size for part in parts) == 168
+    assert (parts[-1].name, parts[-1].size) == ("proximity", 96)
+    assert not any(part.lidar_range for part in parts)
 
 
 def test_the_wrapper_refuses_other_components_and_scales_of_0() -> None:

@@ -15,6 +15,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 
+from recrl.agents.spaces import environment_actions
 from recrl.environments.cmdp import ObservationComponent
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
 from recrl.environments.gymnasium_spaces import float32_vectors
@@ -193,6 +194,37 @@ def test_a_wrapper_that_changes_observations_must_say_what_they_consist_of() -> 
         SyncCMDPVectorEnv("declared", [lambda: Doubled(Declared())])
     plain = SyncCMDPVectorEnv("declared", [lambda: Doubled(Declared(), observation_components=())])
     assert plain.cmdp.components == ()
+
+
+@pytest.mark.parametrize("declared", [None, "lidar", (3,)])
+def test_wrong_components_are_refused_with_the_name_of_the_task(declared: Any) -> None:
+    class Wrong(Countdown):
+        observation_components = declared
+
+    with pytest.raises(ValueError, match=r"^wrong: observation_components must hold recrl\."):
+        SyncCMDPVectorEnv("wrong", [Wrong])
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.uint8, np.int64])
+def test_discrete_actions_of_any_type_are_those_of_an_agent(dtype: Any) -> None:
+    class Typed(Countdown):
+        def __init__(self) -> None:
+            super().__init__()
+            self.action_space = spaces.Discrete(3, dtype=dtype)
+
+        def step(self, action: Any) -> Any:
+            assert self.action_space.contains(action)
+            return super().step(action)
+
+    environments = SyncCMDPVectorEnv("typed", [Typed, Typed])
+    environments.reset(seed=0)
+    actions = environment_actions(environments.single_action_space, np.array([0, 2]))
+    assert actions.dtype == dtype
+    for given in (actions, np.array([0, 2], np.uint64), [0, 2]):
+        environments.step(np.asarray(given))
+    for wrong in (np.array([0, 3]), np.array([-1, 0]), np.array([0.0, 1.0])):
+        with pytest.raises(ValueError, match=r"^typed: actions must lie in Discrete\(3"):
+            environments.step(wrong)
 
 
 @pytest.mark.parametrize(
@@ -404,7 +436,7 @@ def test_keywords_of_gymnasium_and_of_the_class_are_passed_on() -> None:
         (
             "observation",
             np.array([np.nan]),
-            "wrong: an observation must be finite, got ndarray of shape ",
+            "wrong: an observation must be finite in float32, got ndarray of shape ",
         ),
         ("observation", np.zeros(2), "wrong: an observation must lie in Box("),
         ("observation", None, "wrong: an observation must lie in Box("),
@@ -667,6 +699,10 @@ def test_a_factory_that_returns_the_same_environment_twice_is_named() -> None:
         (
             {"episode_actions": [np.zeros(0, np.int64), np.zeros((1, 3), np.int64)]},
             "episode_actions.1 must be int64 of shape (1,), got int64 of shape (1, 3)",
+        ),
+        (
+            {"episode_actions": [np.zeros(0, np.int64), np.array([0, 3])]},
+            "episode_actions.1 must lie in Discrete(3)",
         ),
         ({"checksums": [0]}, "checksums must be of 2 environments, got 1"),
         (

@@ -274,6 +274,12 @@ def test_a_batch_draws_its_frames_or_names_the_modes() -> None:
     assert len(frames) == 2
     with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array', got 'human'"):
         gymnasium.make_vec(IDENTIFIERS[0], num_envs=2, render_mode="human")
+    blind = gymnasium.make_vec(IDENTIFIERS[0], num_envs=2)
+    blind.reset(seed=0)
+    assert blind.render_mode is None
+    assert blind.render() is None
+    with pytest.raises(ValueError, match="render_mode must be None, 'human', 'rgb_array', got 'nope'"):
+        RiverGridEnv(render_mode="nope")
 
 
 @pytest.mark.parametrize(("options", "horizon"), [({}, 200), ({"horizon": 30}, 30)])
@@ -294,6 +300,7 @@ def test_both_environments_draw_the_same_picture() -> None:
         slow.step(action)
         fast.step(np.array([action, LEFT]))
     frames = fast.render()
+    assert frames is not None
     np.testing.assert_array_equal(frames[0], slow.render())
     assert frames[0].shape == (9 * 32, 9 * 32, 3)
     assert frames[0].dtype == np.uint8

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
 import warnings
 from pathlib import Path
@@ -281,6 +282,24 @@ def test_an_episode_ends_when_there_is_no_room_for_a_goal(monkeypatch: pytest.Mo
         *_, terminated, truncated, info = environment.step(drive(environment))
     assert info["goal_met"]
     assert not truncated
+
+
+def test_a_refused_action_leaves_no_trace_in_a_copy() -> None:
+    environment = SafetyGymVectorEnv("CarGoal2", 2)
+    environment.reset(seed=0)
+    with pytest.raises(ValueError, match="actions must be finite"):
+        environment.step(np.full((2, 2), np.nan))
+    twin = copy.deepcopy(environment)
+    for action in held_actions(5, 2):
+        assert as_bytes(environment.step(action)) == as_bytes(twin.step(action))
+
+
+def test_costs_share_no_memory_with_their_terms() -> None:
+    environment = SafetyGymVectorEnv("CarGoal2", 2, cost="per_hazard")
+    environment.reset(seed=0)
+    info = environment.step(np.zeros((2, 2)))[4]
+    terms = [info[f"cost_{name}"] for name in environment.cmdp.cost_names]
+    assert not any(np.shares_memory(info["cost"], term) for term in terms)
 
 
 def test_an_episode_without_room_for_another_goal_begins_with_that_of_its_layout(
