@@ -23,7 +23,8 @@ tests/benchmarks/interval_statistics.py):
     share of 0.95, Wilson              .981    .917    .917
 
 A probability of improvement near 0 or 1 often has no interval (``improvement_interval``); these samples are
-left out. The same script shows that point estimates equal those of rliable 1.2.0 within 2e-16 on 500 random tables.
+left out. The same script shows that point estimates equal those of rliable 1.2.0 within 2e-16 on 500 random
+tables.
 
 ``Interval.is_small`` is true below ``ENOUGH_RUNS``; tables then print a mark. ``mean_interval`` (Student's t)
 has its nominal coverage for normal data at any n >= 2; use it at n = 5.
