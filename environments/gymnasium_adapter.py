@@ -29,7 +29,7 @@ from __future__ import annotations
 import copy
 import functools
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from typing import Any
 
@@ -427,7 +427,7 @@ def _declared_components(name: str, environment: Environment) -> tuple[Observati
     if not environment.has_wrapper_attr("observation_components"):
         return ()
     declared = environment.get_wrapper_attr("observation_components")
-    components = tuple(declared) if isinstance(declared, Sequence) else (declared,)
+    components = tuple(declared) if isinstance(declared, Iterable) else (declared,)
     for component in components:
         if not isinstance(component, ObservationComponent):
             raise ValueError(

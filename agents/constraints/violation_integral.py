@@ -5,7 +5,7 @@ cost. Both come from one rollout, and the step follows the noise of b. So the co
 predicted. It converges above the limit, where the realised fall balances the rise that the rest of the step
 causes. An integral of the gap g, the mean episode cost minus the limit, removes this steady error, as in
 every controller. safety-starter-agents' CPO has it as an option that is off by default (``learn_margin``,
-K = 0.05), without what follows here on e, on costs of 0 and on the bound:
+K = 0.05). It lacks what follows here on e, on costs of 0 and on the bound:
 
     I <- max(I + K min(g, e), 0)    before the step; c is computed from g + I in place of g,
     I <- min(I, d + r)              after the step.

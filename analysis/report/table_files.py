@@ -33,7 +33,8 @@ SHOWN_MEASURES = (Measure.STOCHASTIC, Measure.DETERMINISTIC, Measure.DEPLOYMENT)
 
 TIES = (
     f"P(higher return): a tie counts half. Returns tie within {SOLVED_GAP} of each other where the optimum "
-    "is known, as for solved; elsewhere only where they differ by rounding."
+    "is known, as for solved; elsewhere only where they differ by rounding. It has no interval where all "
+    "tie, or every run of one is better than every run of the other."
 )
 SAMPLED = "That standard error is over the episodes of a trial; the one after ± is over seeds."
 CORRECTED_NOTE = (

@@ -119,6 +119,7 @@ def _best(rows: pd.DataFrame, column: str) -> str:
     """
     ended = rows.assign(ended=rows["planned"] - rows["pending"])
     by_agent = ended.pivot_table("ended", "agent", "method", aggfunc="sum", fill_value=0, observed=True)
+    by_agent = by_agent.loc[:, by_agent.any()]
     if len(by_agent) > 1 and (by_agent.nunique(axis=1) > 1).any():
         return ""
     counts = _by_method(rows)

@@ -90,7 +90,7 @@ def local_cluster(num_cpus: int) -> Iterator[Path]:
         The cluster's folder.
 
     Raises:
-        ClusterError: Ray does not start.
+        ClusterError: Ray does not start, or starts without a token.
     """
     with scratch_folder(_short_folder(), prefix=PREFIX, before_removal=end_processes) as folder:
         token_path = folder / TOKEN

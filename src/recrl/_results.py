@@ -215,7 +215,7 @@ class Policy:
             deterministic: whether to take the mode of the policy instead of a sample.
 
         Returns:
-            For a batch, int64 [B] (discrete actions), or [B, m] with the dtype of the action space
+            For a batch, [B] (discrete actions) or [B, m], with the dtype of the action space
             (continuous ones, within the task's bounds). For one observation, an int or [m].
 
         Raises:

@@ -260,6 +260,15 @@ def test_no_curriculum_is_best_where_agents_have_unequal_numbers_of_trials() -> 
     waiting = [outcome("linear", seed, 0.0, 0.0) for seed in range(5)]
     assert "most often" not in " ".join(answers(judged(rows, waiting=waiting)))
     assert "most often" in " ".join(answers(judged(rows[:10])))
+    even = [
+        outcome(it, seed, 9.5, 5.0, agent=agent)
+        for it in ("none", "linear")
+        for seed in (0, 1)
+        for agent in "ab"
+    ]
+    even[-1] = outcome("linear", 1, 9.6, 6.0, agent="b")
+    waiting = [outcome("dynamic", seed, 0.0, 0.0, agent=agent) for seed in (0, 1) for agent in "ab"]
+    assert "most often with 'none' (4 of 4)" in " ".join(answers(judged(even, waiting=waiting)))
 
 
 def test_policies_that_only_their_standard_error_makes_feasible_are_counted() -> None:

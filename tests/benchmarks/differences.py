@@ -1,15 +1,15 @@
-"""What agents earn and cost above a control: Student's intervals, corrected tests.
+"""What agents earn and cost above a control: intervals and corrected tests.
 
     cd results/safety-gym
     python ../../tests/benchmarks/differences.py margin.csv --control agents.csv
     python ../../tests/benchmarks/differences.py curricula-today.csv --against none
 
 Tables are those of ``final_policies.py``. With ``--control`` each group is the seeds of one agent on one
-task, and the groups are independent; a task without a control is left out. With one agent a task the last
-line averages the tasks' differences. With ``--against`` the control
-is that curriculum in the same tables, and trials are paired by seed, or with ``--groups`` independent. With
-``--limit`` only policies count whose mean cost is at most one standard error, over episodes, above it. The p
-values are corrected for all rows of a table, by Holm's method.
+task, and the groups are independent (Student's intervals); a task without a control is left out. With one
+agent and several tasks the last line averages their differences (Welch's interval). With ``--against`` the
+control is that curriculum in the same tables, and trials are paired by seed, or with ``--groups`` independent
+(Welch). With ``--limit`` only policies count whose mean cost is at most one standard error, over episodes,
+above it. The p values are corrected for all rows of a table, by Holm's method.
 """
 
 from __future__ import annotations
@@ -117,11 +117,11 @@ def main() -> None:
     for table in (rows, control):
         if (table.groupby(["task", "agent"])["method"].nunique() > 1).any():
             raise SystemExit("--control: a table has several curricula of one agent; use --against")
-    one_agent = bool((rows.groupby("task")["agent"].nunique() == 1).all())
+    agents = rows.groupby("task")["agent"].nunique()
     for column in ("return", "cost"):
         print(f"{column}: difference, 95% interval, p, p corrected for all rows")
         print(differences(rows, control, column).round(3).to_string(index=False))
-        if one_agent:
+        if len(agents) > 1 and (agents == 1).all():
             print("mean over the tasks:", average(rows, control, column))
 
 

@@ -140,7 +140,10 @@ def curve(updates: pd.DataFrame, period: int = PERIOD) -> pd.DataFrame:
 
 
 def limit_counts(rows: pd.DataFrame, policy: str) -> Iterator[str]:
-    """Yield how many policies exceed the limit by more than one standard error, and Fisher's exact tests."""
+    """Yield how many policies exceed the limit by more than one standard error, with exact tests.
+
+    Curricula are compared by Fisher's test, agents by the flips of the signs of their differences.
+    """
     chosen = of_policy(rows, policy)
     exceeds = chosen.assign(exceeds=chosen["cost"] > LIMIT + chosen["cost_se"])
     for agent, of_agent in exceeds.groupby("agent", sort=False):
