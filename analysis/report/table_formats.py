@@ -156,9 +156,16 @@ def _cost_suffix(suffixes: Sequence[str], column: str, num_costs: int) -> str:
 
 
 def with_interval(row: pd.Series, name: str) -> str:
-    """Format estimate [low, high] from the three columns of an interval; without ends if they are NaN."""
-    estimate, low, high = (float(row[f"{name}{end}"]) for end in ("", "_low", "_high"))
-    return number(estimate) + ("" if math.isnan(low) else f" [{number(low)}, {number(high)}]")
+    """Format estimate [low, high] from the three columns of an interval; without ends if they are NaN.
+
+    It has two digits after the point; more if the interval excludes 0 and an end would look like 0.
+    """
+    numbers = [float(row[f"{name}{end}"]) for end in ("", "_low", "_high")]
+    estimate, low, high = (f"{value:z.2f}" for value in numbers)  # z: no -0.00
+    if (numbers[1] > 0.0 or numbers[2] < 0.0) and "0.00" in (low, high):
+        estimate, low, high = map(number, numbers)
+    ends = "" if math.isnan(numbers[1]) else f" [{low}, {high}]"
+    return DASH if math.isnan(numbers[0]) else f"{estimate}{ends}"
 
 
 def p_value(value: float) -> str:

@@ -191,9 +191,21 @@ def test_a_small_number_has_two_digits_and_none_is_a_minus_zero(value: float, te
 def test_means_and_intervals_have_no_minus_zero() -> None:
     assert with_error(-0.004, 0.012) == "0.00 ± 0.01"
     row = pd.Series({"gain": -0.001, "gain_low": -0.004, "gain_high": 0.002})
-    assert table_formats.with_interval(row, "gain") == "-0.001 [-0.004, 0.002]"
-    row = pd.Series({"gain": -0.0, "gain_low": -1e-13, "gain_high": 0.0})
     assert table_formats.with_interval(row, "gain") == "0.00 [0.00, 0.00]"
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "text"),
+    [
+        (0.004, 0.6, "0.30 [0.004, 0.60]"),
+        (-0.004, 0.6, "0.30 [0.00, 0.60]"),
+        (0.1, 0.6, "0.30 [0.10, 0.60]"),
+        (math.nan, math.nan, "0.30"),
+    ],
+)
+def test_an_interval_shows_whether_it_excludes_0(low: float, high: float, text: str) -> None:
+    row = pd.Series({"gain": 0.3, "gain_low": low, "gain_high": high})
+    assert table_formats.with_interval(row, "gain") == text
 
 
 def test_markdown_and_latex_by_hand() -> None:
