@@ -61,7 +61,7 @@ class Upload:
         self._number = 0
         self._shown: tuple[Any, ...] | None = None
         self._heartbeat_sent = float("-inf")
-        self._sending = threading.Lock()
+        self._sending = threading.Lock()  # a signal may end the wait for the thread that follows
 
     def follow(self) -> None:
         """Send new commits, if any, and regularly a heartbeat.
@@ -71,16 +71,13 @@ class Upload:
             LostLeaseError: a newer attempt runs the trial.
         """
         with self._sending:
-            self._follow()
-
-    def _follow(self) -> None:
-        record = self._own_record()
-        if record is None:
-            return
-        if self._shown is None or time.monotonic() >= self._heartbeat_sent + ALIVE_SECONDS:
-            self._send_heartbeat(record)
-        if self._shown != _commit_of(record):
-            self.push()
+            record = self._own_record()
+            if record is None:
+                return
+            if self._shown is None or time.monotonic() >= self._heartbeat_sent + ALIVE_SECONDS:
+                self._send_heartbeat(record)
+            if self._shown != _commit_of(record):
+                self.push()
 
     def finish(self) -> None:
         """Send the remaining commits, after the attempt's end; raise the errors of ``follow``."""
