@@ -160,12 +160,13 @@ def with_interval(row: pd.Series, name: str) -> str:
 
     It has two digits after the point; more if the interval excludes 0 and an end would look like 0.
     """
-    numbers = [float(row[f"{name}{end}"]) for end in ("", "_low", "_high")]
-    estimate, low, high = (f"{value:z.2f}" for value in numbers)  # z: no -0.00
-    if (numbers[1] > 0.0 or numbers[2] < 0.0) and "0.00" in (low, high):
-        estimate, low, high = map(number, numbers)
-    ends = "" if math.isnan(numbers[1]) else f" [{low}, {high}]"
-    return DASH if math.isnan(numbers[0]) else f"{estimate}{ends}"
+    values = [float(row[f"{name}{end}"]) for end in ("", "_low", "_high")]
+    estimate, low, high = values
+    texts = [f"{value:z.2f}" for value in values]  # z: no -0.00
+    if (low > 0.0 or high < 0.0) and "0.00" in texts[1:]:
+        texts = [number(value) for value in values]
+    ends = "" if math.isnan(low) else f" [{texts[1]}, {texts[2]}]"
+    return DASH if math.isnan(estimate) else f"{texts[0]}{ends}"
 
 
 def p_value(value: float) -> str:
