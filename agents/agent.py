@@ -114,9 +114,8 @@ class Agent(FinalPolicy, Protocol):
 
         Args:
             rollout: T x B steps collected with the current policy.
-            episode_costs: undiscounted costs of the episodes that finished in it, [E, k]. With E = 0 the
-                mean costs are estimated from the steps so far; only a CVaR is unknown until a first episode
-                has finished.
+            episode_costs: undiscounted costs of the episodes that finished in it, [E, k]. With E = 0 they
+                are estimated from the steps so far.
             step: the curriculum's output for this update. Its limits may be infinite. Its policy noise has
                 already been added (``add_noise``). Agents for which
                 ``learns_rewarded_entropy`` is true use its entropy coefficient.

@@ -26,20 +26,15 @@ class Constraints:
     Attributes:
         limits: d, [k], possibly infinite.
         gaps: constrained value (the mean undiscounted episode cost, or its CVaR) minus limit, [k]; -inf where
-            the limit is infinite, NaN where it is finite and the value is unknown.
-        standard_errors: of the constrained values, [k], at least 0; 0 if they are unknown.
-        episode_length: mean steps of an episode, at least 1; NaN if unknown.
+            the limit is infinite.
+        standard_errors: of the constrained values, [k], at least 0; 0 until two episodes have finished.
+        episode_length: mean steps of an episode, at least 1.
     """
 
     limits: Floats
     gaps: Floats
     standard_errors: Floats
     episode_length: float
-
-    @property
-    def known(self) -> bool:
-        """Whether the gap of every finite limit is known."""
-        return not bool(np.isnan(self.gaps).any())
 
 
 @dataclass(frozen=True, eq=False)

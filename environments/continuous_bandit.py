@@ -125,10 +125,3 @@ class ContinuousBanditVectorEnv(CMDPVectorEnv):
 
     def _observations(self) -> npt.NDArray[np.float32]:
         return np.ones((self.num_envs, 1), np.float32)
-
-
-def make_continuous_bandit(
-    name: str, num_envs: int, options: ContinuousBanditOptions
-) -> ContinuousBanditVectorEnv:
-    """B environments of ``continuous-bandit``."""
-    return ContinuousBanditVectorEnv(name, num_envs, options)

@@ -375,9 +375,7 @@ def _is_flag(value: Any) -> bool:
     return isinstance(value, int | np.integer | np.ndarray) and np.ndim(value) == 0 and value in (0, 1)
 
 
-def names_of_costs(
-    name: str, environment: Environment, given: Sequence[str] | None = None
-) -> tuple[str, ...]:
+def names_of_costs(name: str, environment: Environment, given: Sequence[str] | None) -> tuple[str, ...]:
     """Return the names of the costs: those given, or else the environment's ``cost_names``, or else ``cost``.
 
     Raises:

@@ -88,7 +88,7 @@ TASKS: dict[str, Task] = {
     "continuous-bandit": Task(
         summary="One continuous action, one cost, closed-form optimum: for testing Gaussian policies.",
         options="recrl.environments.continuous_bandit:ContinuousBanditOptions",
-        make="recrl.environments.continuous_bandit:make_continuous_bandit",
+        make="recrl.environments.continuous_bandit:ContinuousBanditVectorEnv",
         optimum="recrl.environments.continuous_bandit:continuous_bandit_optimum",
     ),
     "rivergrid-1a": _river_grid(

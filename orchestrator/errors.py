@@ -30,7 +30,7 @@ class GridError(RecrlError):
 class UntrustedGridError(RecrlError):
     """A grid was checked without its import paths, which were not followed; no mistake was found.
 
-    Attributes:
+    Args:
         source: the grid file's name.
         uncalled: places and texts of the import paths.
     """
@@ -41,8 +41,6 @@ class UntrustedGridError(RecrlError):
             f"{source}: {', '.join(uncalled)} {what}, because a file that is only read must run no code; "
             f"{TRUST_HINT}"
         )
-        self.source = source
-        self.uncalled = uncalled
 
 
 class CheckpointError(RecrlError):

@@ -124,9 +124,7 @@ class LaunchListener:
         """Called if a trial cannot be filmed; the launch continues."""
 
 
-def launch_grid(
-    grid: GridSpec, options: LaunchOptions, listener: LaunchListener | None = None
-) -> LaunchOutcome:
+def launch_grid(grid: GridSpec, options: LaunchOptions, listener: LaunchListener) -> LaunchOutcome:
     """Run the incomplete trials of a checked grid; log them to MLflow, draw the figures, film.
 
     Raises:
@@ -135,7 +133,6 @@ def launch_grid(
     """
     from recrl.analysis.data import sweep_data  # noqa: PLC0415  (imports pandas)
 
-    listener = listener or LaunchListener()
     store = SweepStore(options.root, grid.name)
     place = sweep_place(store, options.storage)
     executor = _executor(grid, place, options)

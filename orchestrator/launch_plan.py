@@ -149,11 +149,6 @@ class Plan:
         found = Counter(trial.action for trial in self.trials)
         return {action: found[action] for action in PlannedAction}
 
-    @property
-    def steps_left(self) -> int:
-        """Environment steps to take, over all trials."""
-        return sum(trial.steps_left for trial in self.trials)
-
 
 @dataclass(frozen=True)
 class Estimate:
@@ -271,7 +266,7 @@ def trials_on_gpus(gpus: float, gpus_per_trial: float) -> int:
         gpus: of the machine, at least 0.
         gpus_per_trial: above 0, and whole above 1. Below 1 several trials share a GPU; none uses two.
     """
-    on_each = int(1.0 / gpus_per_trial + 1e-9)
+    on_each = trials_within(1.0, gpus_per_trial)
     return int(gpus) * on_each if on_each else int(gpus / gpus_per_trial)
 
 

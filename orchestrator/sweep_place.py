@@ -63,15 +63,15 @@ class SweepPlace:
         """
         return nullcontext()
 
-    def pull(self, *, checkpoints: bool = False) -> None:
-        """Bring the folder up to date.
+    def pull(self) -> None:
+        """Bring the folder up to date."""
+
+    def refresh(self, *, checkpoints: bool = False) -> None:
+        """Bring the folder up to date for a reader; log a warning if that is impossible.
 
         Args:
             checkpoints: whether to include those of running trials.
         """
-
-    def refresh(self, *, checkpoints: bool = False) -> None:
-        """Bring the folder up to date for a reader; log a warning if that is impossible."""
 
     def publish(self) -> None:
         """Send the sweep's own files."""

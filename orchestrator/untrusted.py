@@ -21,21 +21,17 @@ LONGEST_NAME = 200
 _NAME = re.compile(r"[^\W_.-][^/\\\x00-\x1f]{0,127}")
 
 
-def checked_name(value: Any) -> str:
-    """Return a sweep's name if it can name a folder: one part of a path, without separators.
+def check_name(value: Any) -> None:
+    """Check that a sweep's name can name a folder: one part of a path, without separators.
 
     Raises:
         ValueError: it cannot.
-
-    >>> checked_name("demo")
-    'demo'
     """
     if not isinstance(value, str) or not _NAME.fullmatch(value) or printable(value) != value:
         raise ValueError(
             "the sweep's name must be a name for a folder that begins with a letter or a digit, "
             f"got {as_written(value)}"
         )
-    return value
 
 
 def plain_text(text: str) -> str:

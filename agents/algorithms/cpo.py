@@ -8,8 +8,7 @@ same numbers, so that b and c have one unit. So the step does not depend on the 
 Costs fall by less than the linear model predicts. So an integral of the violations is added to them, unless
 its gain is 0, as in the source (``recrl.agents.constraints.violation_integral``).
 
-While the constrained cost is unknown (a CVaR before the first episode has finished), the policy does not
-change. A cost whose limit is infinite is no constraint.
+A cost whose limit is infinite is no constraint.
 
 Notation: N samples, k costs, P parameters, delta the trust region's size, H its metric.
 """
@@ -31,8 +30,6 @@ from recrl.agents.trust_region.cpo_dual import DualSolution, StepCase, StepProbl
 from recrl.agents.trust_region.line_search import line_search
 from recrl.agents.trust_region.local_model import LocalModel, linearise, to_parameter_step
 from recrl.environments.cmdp import CMDPSpec
-
-NAN = float("nan")
 
 
 def acceptance(
@@ -89,21 +86,13 @@ class ConstrainedPolicyOptimisation:
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
-        """Take one step in the trust region; skip it while the constrained cost is unknown.
+        """Take one step in the trust region.
 
         Returns:
             Metrics of the step; ``multiplier_i`` are in standard deviations of the reward's advantages per
             unit of cost, ``violation_integral_i`` in episode cost.
         """
         config, integral, constraints = self._config, self._integral, experience.constraints
-        multipliers = np.full_like(constraints.limits, NAN)
-        if not constraints.known:
-            stayed = {"policy_steps": 0.0, "case": NAN, "line_search_steps": NAN, "step_norm": 0.0}
-            return {
-                **stayed,
-                **indexed("multiplier", multipliers),
-                **indexed("violation_integral", multipliers),
-            }
         advantages, spreads = standardised_advantages(experience.advantages)
         model = LocalModel(policy, experience, advantages)
         active = ActiveConstraints.of(integral.corrected(constraints)).divided_by(spreads[1:])
@@ -114,7 +103,7 @@ class ConstrainedPolicyOptimisation:
         metrics = line_search(policy, to_parameter_step(solution, solved), is_acceptable, config)
         reach = problem.reach * spreads[1 + active.index] * constraints.episode_length
         integral.bound(active.index, constraints.limits[active.index], reach)
-        multipliers[:] = 0.0
+        multipliers = np.zeros_like(constraints.limits)
         multipliers[active.index] = solution.multipliers / spreads[1 + active.index]
         return {
             **metrics,

@@ -24,9 +24,6 @@ a reward step ends at the limit. Before, steps go as far beyond the limit on one
 coefficient tau is the option ``kl_penalty``, with the unit and the purpose of that of ``trpo-lag``; 0 is the
 source's.
 
-While the constrained cost is unknown (a CVaR before the first episode has finished), the policy does not
-change.
-
 Notation: N samples, k costs, of which j have a finite limit.
 """
 
@@ -122,12 +119,9 @@ class ConstraintRectifiedPolicyOptimisation:
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
-        """Take one reward step or cost step; skip it while the constrained cost is unknown."""
+        """Take one reward step or cost step."""
         constraints = experience.constraints
         config = self._config
-        if not constraints.known:
-            stayed = {"policy_steps": 0.0, "line_search_steps": float("nan"), "step_norm": 0.0}
-            return {**stayed, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
         advantages, spreads = standardised_advantages(experience.advantages)
         active = ActiveConstraints.of(constraints).divided_by(spreads[1:])
         model = LocalModel(policy, experience, advantages)

@@ -18,8 +18,7 @@ which its slope is kappa,
 so that a violated constraint is an exact penalty with the factor kappa. Advantages and c are in the units of
 ``constraints.relative_units``, so that one kappa serves tasks of any units.
 
-While the constrained cost is unknown (a CVaR before the first episode has finished), the policy does not
-change. Notation: N samples, D pairs, k costs, j of them can bind.
+Notation: N samples, D pairs, k costs, j of them can bind.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ from recrl.agents.learning.gradient_ascent import (
     Objective,
     normalised_by_penalties,
 )
-from recrl.agents.learning.policy_rule import indexed, no_steps
+from recrl.agents.learning.policy_rule import indexed
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
@@ -115,10 +114,8 @@ class InteriorPointPolicyOptimisation(FirstOrderRule[IPOConfig]):
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
-        """Ascend the surrogate with barriers; skip it while the constrained cost is unknown."""
+        """Ascend the surrogate with barriers."""
         config = self._config
-        if not experience.constraints.known:
-            return no_steps(experience.constraints)
         active = RelativeConstraints.of(experience, self._units)
 
         def objective(part: Experience) -> Objective:

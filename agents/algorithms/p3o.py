@@ -13,8 +13,7 @@ Where a limit is kept the penalty has no gradient at first. The first steps foll
 Adam step may leave the trust region before the penalty acts. So, ours, the change is scaled back to the KL
 target_kl: ``trust_region: kept``.
 
-While the constrained cost is unknown (a CVaR before the first episode has finished), the policy does not
-change. Notation: N samples, D pairs, k costs, j of them can bind.
+Notation: N samples, D pairs, k costs, j of them can bind.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from recrl.agents.learning.gradient_ascent import (
     RadiusRule,
     normalised_by_penalties,
 )
-from recrl.agents.learning.policy_rule import indexed, no_steps
+from recrl.agents.learning.policy_rule import indexed
 from recrl.environments.cmdp import CMDPSpec, Floats
 
 
@@ -86,10 +85,8 @@ class PenalisedProximalPolicyOptimisation(RadiusRule[P3OConfig]):
     def improve(
         self, policy: StochasticPolicy, experience: Experience, generator: np.random.Generator
     ) -> dict[str, float]:
-        """Ascend the penalised surrogate; skip it while the constrained cost is unknown."""
+        """Ascend the penalised surrogate."""
         config = self._config
-        if not experience.constraints.known:
-            return no_steps(experience.constraints)
         active = RelativeConstraints.of(experience, self._units)
 
         def objective(part: Experience) -> Objective:

@@ -13,8 +13,7 @@ for k = 1, nu = max(0, e) / S, as in the paper. The projection of a policy far f
 The paper bounds the damage; here the step is scaled back into the trust region. Then ``cpo``'s line search
 shortens it, which the paper does not do.
 
-While the constrained cost is unknown (a CVaR before the first episode has finished), the policy does not
-change. Notation: N samples, k costs, P parameters.
+Notation: N samples, k costs, P parameters.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """PPO on the Lagrangian (Ray et al. 2019, section 5).
 
 First the multipliers are updated from the gaps. Then the policy ascends the penalised surrogate, until its
-steps are done or the KL is too large. While the constrained cost is unknown (a CVaR before the first episode
-has finished), the multipliers do not change.
+steps are done or the KL is too large.
 
 The objective is (L_r - sum_i p_i L_i) / (1 + sum_i p_i), p the multipliers. ``separate`` clips the reward's
 surrogate only (the paper's agents); ``combined`` clips the surrogate of the penalised advantage

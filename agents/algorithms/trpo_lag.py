@@ -1,8 +1,7 @@
 """TRPO on the Lagrangian (Ray et al. 2019, section 5).
 
 First the multipliers p are updated from the gaps. Then the policy takes one trust-region step on the
-surrogate of (A_r - sum_i p_i A_i) / (1 + sum_i p_i). While the constrained
-cost is unknown (a CVaR before the first episode has finished), the multipliers do not change.
+surrogate of (A_r - sum_i p_i A_i) / (1 + sum_i p_i).
 
 At a saddle point of the Lagrangian that surrogate has no gradient. A step to the edge of the trust region has
 the same length there as elsewhere, so the policy would oscillate about the limit. So, ours, the KL is

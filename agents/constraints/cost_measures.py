@@ -120,8 +120,8 @@ class Episodes:
 
     @property
     def mean_length(self) -> float:
-        """Their mean number of steps; NaN without an episode."""
-        return float(self.lengths.mean()) if len(self.lengths) else math.nan
+        """Their mean number of steps, if there is an episode."""
+        return float(self.lengths.mean())
 
 
 class RecentEpisodes:
@@ -187,9 +187,9 @@ class MeasuredCosts:
 
     Attributes:
         step_costs: per step, whose sums over an episode are constrained, [T, B, k].
-        values: for comparison with the limits, [k]; NaN if unknown.
+        values: for comparison with the limits, [k].
         standard_errors: of ``values``, [k], at least 0; those of a CVaR for a given value at risk.
-        episode_length: mean steps of an episode, at least 1; NaN if unknown.
+        episode_length: mean steps of an episode, at least 1.
     """
 
     step_costs: Floats
@@ -263,17 +263,17 @@ class TailCost:
     def measure(self, rollout: Rollout, episodes: Episodes, limits: Floats) -> MeasuredCosts:
         """Return the tail costs, and the CVaR if it is within the limit, else a bound on it.
 
-        Before a first episode has finished, the value at risk is taken to be 0 and the CVaR is unknown.
+        Until a first episode has finished, those under way count as if they had. Their CVaR is too low.
 
         Args:
             rollout: the steps.
             episodes: of the window.
             limits: d, [k], possibly infinite.
         """
-        known = len(episodes.costs) > 0
-        at_risk = value_at_risk(episodes.costs, self._level) if known else np.zeros_like(limits)
-        threshold = np.minimum(at_risk, limits)
-        values = tail_bound(episodes.costs, threshold, self._level) if known else np.full_like(limits, np.nan)
+        if not len(episodes.costs):
+            episodes = _under_way(rollout)
+        threshold = np.minimum(value_at_risk(episodes.costs, self._level), limits)
+        values = tail_bound(episodes.costs, threshold, self._level)
         beyond = np.maximum(episodes.costs - threshold, 0.0) / (1.0 - self._level)
         costs = tail_costs(
             rollout.costs,
@@ -283,3 +283,9 @@ class TailCost:
             level=self._level,
         )
         return MeasuredCosts(costs, values, standard_errors(beyond), episodes.mean_length)
+
+
+def _under_way(rollout: Rollout) -> Episodes:
+    """Return the B episodes of a rollout in which none ended, as if they ended with it."""
+    costs = rollout.carried_costs + rollout.costs.sum(axis=0)
+    return Episodes(costs, rollout.carried_lengths + len(rollout.costs), finished=0)

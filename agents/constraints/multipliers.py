@@ -8,8 +8,7 @@ to the multipliers' units: the agent ascends A_r - sum_i mu_i A_i.
 per unit of cost, the multiplier of the CMDP is lambda_i = mu_i u_i. ``cost`` is the paper's: violations in
 episode cost, standardised reward advantages, raw cost advantages.
 
-While the constrained cost is unknown (a CVaR before the first episode has finished), the multipliers do not
-change. A cost with an infinite limit has the multiplier 0.
+A cost with an infinite limit has the multiplier 0.
 
 Notation: N samples, k costs.
 """
@@ -77,7 +76,7 @@ class Multipliers:
         self._units = RelativeUnits(num_costs)
 
     def update(self, experience: Experience) -> Penalty:
-        """Update the multipliers, unless the violations are unknown; return the scaled advantages."""
+        """Update the multipliers; return the scaled advantages."""
         multipliers = self.move(experience.constraints)
         if self._is_relative:
             scaled = self._units.of(experience.advantages, experience.constraints.limits)
@@ -86,12 +85,11 @@ class Multipliers:
         return Penalty(centred[:, 0] / reward_spread(centred), centred[:, 1:], multipliers, multipliers)
 
     def move(self, constraints: Constraints) -> Floats:
-        """Update the multipliers, unless the violations are unknown; return them, mu, [k]."""
-        if constraints.known:
-            gaps = constraints.gaps
-            if self._is_relative:
-                gaps = relative_gaps(gaps, constraints.limits, constraints.standard_errors)
-            self._state = self._step(self._state, gaps)
+        """Update the multipliers; return them, mu, [k]."""
+        gaps = constraints.gaps
+        if self._is_relative:
+            gaps = relative_gaps(gaps, constraints.limits, constraints.standard_errors)
+        self._state = self._step(self._state, gaps)
         return np.where(np.isfinite(constraints.limits), self._state["multipliers"], 0.0)
 
     def state_dict(self) -> dict[str, Any]:

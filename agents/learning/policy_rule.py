@@ -15,7 +15,7 @@ import torch
 from recrl.agents.building_blocks.distributions import mean_divergence
 from recrl.agents.building_blocks.policies import StochasticPolicy
 from recrl.agents.building_blocks.surrogates import surrogate
-from recrl.agents.experience import Constraints, Experience
+from recrl.agents.experience import Experience
 
 
 class Stateful(Protocol):
@@ -59,11 +59,6 @@ def indexed(name: str, values: npt.NDArray[np.floating]) -> dict[str, float]:
     return {
         f"{name}_{i}": float(value) if np.isfinite(value) else float("nan") for i, value in enumerate(values)
     }
-
-
-def no_steps(constraints: Constraints) -> dict[str, float]:
-    """Return the metrics of a first-order update that is skipped, as the constraints are unknown."""
-    return {"policy_steps": 0.0, **indexed("multiplier", np.full_like(constraints.limits, np.nan))}
 
 
 def improve_and_measure(

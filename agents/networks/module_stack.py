@@ -38,7 +38,7 @@ def perceptron(
     hidden_sizes: Sequence[int],
     activation: str,
     initialiser: Callable[[Tensor, torch.Generator], None],
-    last_scale: float = 1.0,
+    last_scale: float,
 ) -> Callable[[torch.Generator], ModuleFactory]:
     """Return a factory of multi-layer perceptrons with an activation between the layers.
 
@@ -220,7 +220,7 @@ class _Scaled(nn.Module):
         return outputs
 
 
-def checked_module(factory: ModuleFactory, num_inputs: int, num_outputs: int, *, role: str = "") -> nn.Module:
+def checked_module(factory: ModuleFactory, num_inputs: int, num_outputs: int, *, role: str) -> nn.Module:
     """Make a network and test it on two rows.
 
     Args:

@@ -45,7 +45,7 @@ from recrl.orchestrator.files.atomic_files import write_atomically
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.trial_files import EVALUATION_COLUMNS, UPDATE_COLUMNS
 from recrl.orchestrator.spec import TrialSpec, TrialStatus
-from recrl.orchestrator.untrusted import LimitValues, checked_name
+from recrl.orchestrator.untrusted import LimitValues, check_name
 from recrl.orchestrator.validation_sentences import sentences
 
 SUFFIX = ".zip"
@@ -163,7 +163,7 @@ def load(path: Path) -> Sweep:
         for name, frame in rows.items():
             _check_rows(name, frame, facts)
         _check_limits(rows["updates"], facts)
-        checked_name(checked.name)
+        check_name(checked.name)
     except ValidationError as error:
         place, sentence = next(sentences(error, None))
         where = ".".join(map(str, place))

@@ -59,7 +59,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import EPISODE_COLUMNS, EVALUATION_COLUMNS, UPDATE_COLUMNS
 from recrl.orchestrator.files.trial_reader import TrialReader
 from recrl.orchestrator.spec import TrialSpec, TrialStatus
-from recrl.orchestrator.untrusted import checked_name
+from recrl.orchestrator.untrusted import check_name
 
 TRIAL_COLUMNS = (
     "trial_id",
@@ -303,7 +303,7 @@ def assemble(
     """
     keys, doubles = keys_of([it.spec for it in facts])
     try:
-        checked_name(name)
+        check_name(name)
     except ValueError as error:
         raise RecrlError(str(error)) from error
     tabulated = rows["policies"][TRIAL].unique() if len(rows["policies"]) else ()

@@ -27,7 +27,6 @@ from recrl.analysis.statistics.curves import ShownSteps, mean_curve
 from recrl.environments.cmdp import Floats
 from recrl.orchestrator.files.trial_files import POLICY_NOISE
 
-BINS = 100
 RECOVERY_CASE = 2.0  # CPO's ``case`` of a step that only decreases the cost
 LARGE_MULTIPLIER = 50.0
 EVENT_HEIGHT = 0.04  # of the events' marks, as a fraction of the panel's height
@@ -58,7 +57,7 @@ def curriculum_diagnostics(sweep: Sweep, task: str, agent: str, *, cost: int = 0
         panels.rows_of(frame, task, agent) for frame in (sweep.trials, sweep.updates, sweep.events)
     )
     shown_steps = ShownSteps.of(trials)
-    edges = shown_steps.grid(BINS)
+    edges = shown_steps.grid()
     look = styles.styles_of(sweep)
     methods = [method for method in look if (updates["method"] == method).any()]
     quantities = (

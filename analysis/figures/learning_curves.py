@@ -28,7 +28,6 @@ from recrl.analysis.statistics.curves import MEAN, CurveAverage, ShownSteps, mea
 from recrl.analysis.statistics.verdicts import SOLVED_GAP
 from recrl.environments.cmdp import Floats
 
-BINS = 100
 DEPLOYMENT_BINS = 25
 ROW_HEIGHT = 1.42
 LEAST_SHOWN = 0.2  # of a limit, above and below it
@@ -173,7 +172,7 @@ def _pair(
     deployment_edges = np.linspace(boundary, total, min(DEPLOYMENT_BINS, deployment_updates) + 1)
     deployed = updates[updates["end_step"] > boundary]
     for axes, edges, rows in (
-        (whole, shown_steps.grid(BINS), updates),
+        (whole, shown_steps.grid(), updates),
         (magnified, deployment_edges, deployed),
     ):
         _curves(axes, rows, quantity, edges, look, averaging=averaging)
@@ -216,7 +215,7 @@ def _curriculum_panel(
     axes: Axes, trials: pd.DataFrame, updates: pd.DataFrame, look: dict[str, MethodStyle], i: int
 ) -> None:
     shown_steps = ShownSteps.of(trials)
-    edges = shown_steps.grid(BINS)
+    edges = shown_steps.grid()
     infinite = 0
     for position, (method, style) in enumerate(look.items()):
         chosen = updates[updates["method"] == method]

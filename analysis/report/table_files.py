@@ -174,23 +174,20 @@ def _remove_earlier(folder: Path, written: Sequence[Path]) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-def write_outcomes(sweep: Sweep, folder: Path) -> list[Path]:
-    """Write only ``outcomes.csv``, as ``write_tables`` does.
+def write_outcomes(sweep: Sweep, folder: Path) -> None:
+    """Write only ``outcomes.csv``, as ``write_tables`` does, if a trial is complete.
+
+    A file that has these rows already keeps its time, because the report counts as older than outcomes that
+    were written after it.
 
     Args:
         sweep: its frames.
         folder: where the file goes.
-
-    Returns:
-        The file; nothing is written before a trial is complete. A file that has these rows already keeps its
-        time, because the report counts as older than outcomes that were written after it.
     """
     rows, path = metrics.outcomes(sweep), folder / OUTCOMES_FILE
-    if not len(rows):
-        return []
-    if path.exists() and path.read_bytes() == table_formats.csv_bytes(rows):
-        return [path]
-    return [table_formats.write_csv(rows, path)]
+    if not len(rows) or (path.exists() and path.read_bytes() == table_formats.csv_bytes(rows)):
+        return
+    table_formats.write_csv(rows, path)
 
 
 def _claims(counted_claims: pd.DataFrame) -> ShownTable:

@@ -43,7 +43,7 @@ LATEX = {
 }
 
 
-def outcome_table(summary: pd.DataFrame, measure: Measure, suffixes: Sequence[str] = ()) -> pd.DataFrame:
+def outcome_table(summary: pd.DataFrame, measure: Measure, suffixes: Sequence[str]) -> pd.DataFrame:
     """Format return, costs, regret and fractions of feasible and solved seeds.
 
     The regret, J*(d_d) minus the return, is left out if a seed is infeasible, because its return may be above
@@ -53,7 +53,7 @@ def outcome_table(summary: pd.DataFrame, measure: Measure, suffixes: Sequence[st
     Args:
         summary: of ``metrics.summary``.
         measure: which of the three outcomes.
-        suffixes: of ``cost_suffix`` for each cost; the numbers of the CSV files by default.
+        suffixes: of ``cost_suffix`` for each cost.
     """
     rows = summary[summary["measure"] == measure.value]
     costs = [name for name in map(str, rows) if f"{name}_se" in rows and name.startswith("cost_")]
@@ -65,7 +65,7 @@ def outcome_table(summary: pd.DataFrame, measure: Measure, suffixes: Sequence[st
         if any_failed:
             line["failed"] = str(row["failed"])
         for name in costs:
-            which = _cost_suffix(suffixes, name, len(costs))
+            which = _suffix_of(name, suffixes)
             line[f"cost{which}"] = cost_with_error(row[name], row[f"{name}_se"], exact=row["exact"])
             line[f"limit{which}"] = number(row[f"deploy_limit_{name[5:]}"])
         line["return"] = with_error(row["episode_return"], row["episode_return_se"])
@@ -115,7 +115,7 @@ def compared_rows(comparisons: pd.DataFrame, summary: pd.DataFrame, measure: Mea
     return merged.assign(failed=merged["failed"] + merged["baseline_failed"])
 
 
-def comparison_table(rows: pd.DataFrame, suffixes: Sequence[str] = ()) -> pd.DataFrame:
+def comparison_table(rows: pd.DataFrame, suffixes: Sequence[str]) -> pd.DataFrame:
     """Format paired differences to the agent without a curriculum.
 
     More return is no gain if a policy of a pair is infeasible, with the curriculum or with none. Such a row
@@ -142,7 +142,7 @@ def comparison_table(rows: pd.DataFrame, suffixes: Sequence[str] = ()) -> pd.Dat
         if any_tested:
             line[CORRECTED] = DASH if no_gain else p_value(row["return_difference_p_corrected"])
         for name in costs:
-            title = f"cost{_cost_suffix(suffixes, name, len(costs))} added"
+            title = f"cost{_suffix_of(name, suffixes)} added"
             line[title] = with_interval(row, name)
         mark = TOO_FEW if row["too_few_seeds"] and not math.isnan(row["improvement_low"]) else ""
         line["P(higher return)"] = DASH if no_gain else with_interval(row, "improvement") + mark
@@ -150,9 +150,8 @@ def comparison_table(rows: pd.DataFrame, suffixes: Sequence[str] = ()) -> pd.Dat
     return pd.DataFrame(lines)
 
 
-def _cost_suffix(suffixes: Sequence[str], column: str, num_costs: int) -> str:
-    i = int(column.split("_")[1])
-    return suffixes[i] if i < len(suffixes) else "" if num_costs == 1 else f" {i}"
+def _suffix_of(column: str, suffixes: Sequence[str]) -> str:
+    return suffixes[int(column.split("_")[1])]
 
 
 def with_interval(row: pd.Series, name: str) -> str:

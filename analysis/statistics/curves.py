@@ -14,6 +14,7 @@ from recrl.analysis.statistics.intervals import CONFIDENCE, ENOUGH_RUNS, interqu
 from recrl.analysis.statistics.verdicts import is_cost
 from recrl.environments.cmdp import Floats
 
+BINS = 100  # of a trial's steps, at most
 BAND_REPLICATIONS = 500  # a band has a hundred intervals
 BAND_ENDS = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
 
@@ -27,14 +28,12 @@ class Curve:
         centre: mean or interquartile mean over the runs with data in the bin, [g]; NaN without any.
         low: lower end of the band, [g]; NaN with fewer than two such runs.
         high: upper end, likewise.
-        runs: number of such runs, int [g].
     """
 
     steps: Floats
     centre: Floats
     low: Floats
     high: Floats
-    runs: npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -105,9 +104,9 @@ class ShownSteps:
         total = int(trials["total_steps"].max())
         return cls(int(trials["boundary_step"].min()), total, int(total // trials["steps_per_update"].min()))
 
-    def grid(self, bins: int) -> Floats:
-        """Return the ``step_grid`` with at most ``bins`` bins."""
-        return step_grid(self.boundary, self.total, updates=self.updates, bins=bins)
+    def grid(self) -> Floats:
+        """Return the ``step_grid`` with at most ``BINS`` bins."""
+        return step_grid(self.boundary, self.total, updates=self.updates, bins=BINS)
 
 
 def binned_runs(updates: pd.DataFrame, column: str, edges: Floats) -> Floats:
@@ -152,7 +151,7 @@ def mean_curve(updates: pd.DataFrame, column: str, edges: Floats) -> Curve:
     mean = _divided(np.where(present, runs, 0.0).sum(axis=0), count)
     squares = np.where(present, (runs - mean) ** 2, 0.0).sum(axis=0)
     error = np.sqrt(_divided(squares, (count - 1) * count))
-    return Curve(_centres(edges), mean, mean - error, mean + error, count.astype(np.int64))
+    return Curve(_centres(edges), mean, mean - error, mean + error)
 
 
 def interquartile_curve(
@@ -183,7 +182,7 @@ def interquartile_curve(
             resampled = generator.integers(count, size=(BAND_REPLICATIONS, count))
             replicated = interquartile_mean(scores[:, resampled][..., None])
             low[bins], high[bins] = np.quantile(replicated, BAND_ENDS, axis=-1)
-    return Curve(_centres(edges), centre, low, high, present.sum(axis=0).astype(np.int64))
+    return Curve(_centres(edges), centre, low, high)
 
 
 MEAN = CurveAverage("mean ± standard error over seeds", mean_curve)

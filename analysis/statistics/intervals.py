@@ -164,20 +164,18 @@ def stratified_bootstrap(
     statistic: Statistic,
     generator: np.random.Generator,
     *,
-    confidence: float = CONFIDENCE,
     replications: int = REPLICATIONS,
 ) -> Interval:
-    """Return the percentile interval of a statistic; runs are resampled within every task.
+    """Return the 95% percentile interval of a statistic; runs are resampled within every task.
 
     Args:
         scores: [n, m].
         statistic: [..., n, m] -> [...].
         generator: draws the resamples.
-        confidence: of the interval, in (0, 1).
         replications: r, number of resamples.
     """
     replicated = statistic(_resampled(scores, generator, replications))
-    return _percentile_interval(float(statistic(scores)), replicated, len(scores), confidence)
+    return _percentile_interval(float(statistic(scores)), replicated, len(scores))
 
 
 def improvement_interval(
@@ -205,7 +203,7 @@ def improvement_interval(
         _resampled(scores, generator, replications), _resampled(others, generator, replications), tie=tie
     )
     estimate = float(probability_of_improvement(scores, others, tie=tie))
-    found = _percentile_interval(estimate, replicated, min(len(scores), len(others)), CONFIDENCE)
+    found = _percentile_interval(estimate, replicated, min(len(scores), len(others)))
     return replace(found, low=math.nan, high=math.nan) if found.low == found.high else found
 
 
@@ -360,9 +358,9 @@ def _resampled(scores: Floats, generator: np.random.Generator, replications: int
     return scores[rows, np.arange(tasks)]
 
 
-def _percentile_interval(estimate: float, replicated: Floats, runs: int, confidence: float) -> Interval:
+def _percentile_interval(estimate: float, replicated: Floats, runs: int) -> Interval:
     if runs < 2:
         return Interval(estimate, math.nan, math.nan, runs, True)
-    tail = (1.0 - confidence) / 2.0
+    tail = (1.0 - CONFIDENCE) / 2.0
     low, high = np.quantile(replicated, [tail, 1.0 - tail])
     return Interval(estimate, float(low), float(high), runs, runs < ENOUGH_RUNS)

@@ -31,9 +31,7 @@ def river_minigrid(river_map: RiverMap) -> Grid:
     return grid
 
 
-def render_frame(
-    river_map: RiverMap, cell: Cell, heading: int, *, tile_pixels: int = TILE_PIXELS
-) -> npt.NDArray[np.uint8]:
-    """Render the map with the agent in ``cell``, uint8 [height tile_pixels, width tile_pixels, 3]."""
-    frame: npt.NDArray[np.uint8] = river_minigrid(river_map).render(tile_pixels, cell, heading)
+def render_frame(river_map: RiverMap, cell: Cell, heading: int) -> npt.NDArray[np.uint8]:
+    """Render the map with the agent in ``cell``, uint8 [height TILE_PIXELS, width TILE_PIXELS, 3]."""
+    frame: npt.NDArray[np.uint8] = river_minigrid(river_map).render(TILE_PIXELS, cell, heading)
     return frame

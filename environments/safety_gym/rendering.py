@@ -57,17 +57,11 @@ _ROOM = """
 
 
 class SafetyRenderer(MujocoRenderer[SafetyGymBatch]):
-    """Renderer for single environments of a batch; see ``MujocoRenderer``.
+    """Renderer for single environments of a batch; see ``MujocoRenderer``."""
 
-    Args:
-        batch: the environments.
-        width: of a frame, pixels, at most 1,920.
-        height: of a frame, pixels, at most 1,080.
-    """
-
-    def __init__(self, batch: SafetyGymBatch, width: int = 480, height: int = 360) -> None:
+    def __init__(self, batch: SafetyGymBatch) -> None:
         model = _coloured_model(batch)
-        super().__init__(batch, model, width, height, distance=CAMERA_DISTANCE, elevation=CAMERA_ELEVATION)
+        super().__init__(batch, model, distance=CAMERA_DISTANCE, elevation=CAMERA_ELEVATION)
 
     def frame(self, index: int) -> Frame:
         """Render the present state of environment ``index``, [height, width, 3]."""

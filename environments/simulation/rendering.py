@@ -11,6 +11,7 @@ import numpy as np
 from recrl.environments.simulation.camera import Frame, make_context
 from recrl.environments.simulation.environment_batch import EnvironmentBatch
 
+WIDTH, HEIGHT = 480, 360  # of a frame, pixels
 MAX_GEOMS = 1000
 CAMERA_AZIMUTH = 90.0
 
@@ -22,9 +23,8 @@ class MujocoRenderer(Generic[BatchT]):
 
     Args:
         batch: the environments.
-        model: the model to render; its state has the layout of the simulated one.
-        width: of a frame, pixels, at most the model's off-screen width.
-        height: of a frame, pixels, at most the model's off-screen height.
+        model: the model to render, off-screen at least a frame wide and high; its state has the layout of
+            the simulated one.
         distance: of the camera, metres.
         elevation: of the camera, degrees.
 
@@ -36,8 +36,6 @@ class MujocoRenderer(Generic[BatchT]):
         self,
         batch: BatchT,
         model: mujoco.MjModel,
-        width: int,
-        height: int,
         *,
         distance: float,
         elevation: float,
@@ -45,12 +43,12 @@ class MujocoRenderer(Generic[BatchT]):
         self._batch = batch
         self._model = model
         self._data = mujoco.MjData(model)
-        self._context = make_context(width, height)
+        self._context = make_context(WIDTH, HEIGHT)
         self._drawing = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._drawing)
         self._scene = mujoco.MjvScene(model, maxgeom=MAX_GEOMS)
         self._look = mujoco.MjvOption()
-        self._area = mujoco.MjrRect(0, 0, width, height)
+        self._area = mujoco.MjrRect(0, 0, WIDTH, HEIGHT)
         self._camera = mujoco.MjvCamera()
         self._camera.distance, self._camera.elevation, self._camera.azimuth = (
             distance,

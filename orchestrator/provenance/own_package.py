@@ -23,12 +23,7 @@ def source_digest() -> str:
     for name in FOLDERS:  # links in a source checkout: walking the parent would not follow them
         folder = folder_of(name)
         files |= {f"{name}/{path.relative_to(folder).as_posix()}": path for path in folder.rglob("*.py")}
-    return digest_of_files(files)[:10]
-
-
-def digest_of_files(files: Mapping[str, Path]) -> str:
-    """Return 64 hex digits that change with the name of a file and with any of its bytes."""
-    return _digest(files, Path.read_bytes)
+    return _digest(files, Path.read_bytes)[:10]
 
 
 def digest_of_code(files: Mapping[str, Path]) -> str:

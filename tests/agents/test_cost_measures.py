@@ -145,11 +145,14 @@ def test_the_worst_episodes_are_those_of_the_window_whichever_of_them_are_new(fi
     assert found.values.tolist() == pytest.approx([2.0 + 2.0 / 3.0])
 
 
-def test_before_a_first_episode_all_cost_counts_and_the_worst_episodes_are_unknown() -> None:
-    found = TailCost(0.5).measure(rollout_of(np.array([1.0, 3.0])), NONE, np.array([9.0]))
-    assert found.step_costs.ravel().tolist() == [2.0, 6.0]
-    assert math.isnan(found.values[0])
-    assert found.standard_errors.tolist() == [0.0]
+def test_before_a_first_episode_has_finished_those_under_way_count() -> None:
+    """They cost 4 and 6 so far, so the worst half costs 6: 2 beyond 4, the value at risk at level 0.5."""
+    rollout = rollout_of(np.array([[1.0, 3.0], [3.0, 3.0]]))
+    found = TailCost(0.5).measure(rollout, NONE, np.array([9.0]))
+    assert found.values.tolist() == [6.0]
+    assert found.step_costs[..., 0].tolist() == [[0.0, 0.0], [0.0, 4.0]]
+    assert found.standard_errors.tolist() == [2.0]
+    assert found.episode_length == 2.0
 
 
 def test_the_standard_error_is_that_of_the_constrained_value() -> None:

@@ -35,7 +35,7 @@ def improve(
         np.array(limits or [10.0, 10.0]),
         np.array(gaps),
         np.zeros(2),
-        math.nan if math.isnan(gaps[0]) else LENGTH,
+        LENGTH,
     )
     rule = ConstrainedPolicyOptimisation(CPOConfig(target_kl=DELTA, violation_integral_gain=0.0), 2)
     experience = Experience.of(policy, batch, advantages, constraints)
@@ -80,13 +80,6 @@ def test_no_limit_gives_the_unconstrained_step(space: Space[object]) -> None:
     slack, _, expected = improve(space, [-100.0, -100.0])
     np.testing.assert_allclose(after, expected, atol=1e-6)
     assert unlimited["multiplier_0"] == slack["multiplier_0"] == 0.0
-
-
-def test_without_a_finished_episode_the_policy_stays() -> None:
-    metrics, before, after = improve(SPACES[0], [math.nan, math.nan])
-    np.testing.assert_array_equal(after, before)
-    assert metrics["policy_steps"] == metrics["step_norm"] == 0.0
-    assert math.isnan(metrics["case"])
 
 
 def test_violations_enter_in_cost_per_step() -> None:

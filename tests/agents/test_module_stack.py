@@ -233,7 +233,7 @@ def with_a_frozen_layer(num_inputs: int, num_outputs: int) -> nn.Module:
 )
 def test_what_is_wrong_with_a_network_is_said(factory: Callable[[int, int], Any], sentence: str) -> None:
     with pytest.raises(NetworkError, match=sentence):
-        checked_module(factory, 4, 2)
+        checked_module(factory, 4, 2, role="policy")
 
 
 @pytest.mark.parametrize("role", ["policy", "critic"])

@@ -34,7 +34,7 @@ def test_a_module_computes_what_the_agent_does(space: Any, own: bool, normalise:
     )
     encoder.learn(observations(50))
     generator = torch.Generator().manual_seed(0)
-    factory = perceptron([8], "relu", INITIALISER)(generator) if own else None
+    factory = perceptron([8], "relu", INITIALISER, last_scale=1.0)(generator) if own else None
     policy = make_policy(
         encoder.size, space, NetworkArchitecture((8, 8), INITIALISER, "tanh", factory), 0.5, generator
     )

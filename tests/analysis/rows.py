@@ -3,6 +3,8 @@
 import numpy as np
 import pandas as pd
 
+ONE_COST = ("",)  # suffixes of the column of one cost
+
 
 def only(frame: pd.DataFrame, **values: object) -> pd.Series:
     """The one row that has these values."""

@@ -43,7 +43,6 @@ def test_a_curve_is_the_mean_and_standard_error_over_seeds() -> None:
     assert curve.centre.tolist() == [3.0, 5.0]
     assert curve.high[0] - curve.centre[0] == pytest.approx(math.sqrt(7.0 / 3.0))
     assert math.isnan(curve.low[1])
-    assert curve.runs.tolist() == [3, 1]
 
 
 def test_curves_on_one_bin_equal_the_phase_means(finished: Sweep) -> None:
@@ -65,7 +64,6 @@ def test_an_interquartile_curve_is_robust_and_has_a_band() -> None:
     assert curve.centre.tolist()[:2] == [3.0, 5.0]
     assert curve.low[0] < 3.0 < curve.high[0]
     assert np.isnan([curve.low[1], curve.high[1], curve.centre[2]]).all()
-    assert curve.runs.tolist() == [5, 1, 0]
 
 
 def test_a_band_is_the_bootstrap_interval_of_each_bin() -> None:

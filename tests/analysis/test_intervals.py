@@ -158,11 +158,10 @@ def test_equal_generators_give_equal_intervals() -> None:
 
 
 def test_bootstrap_mean_agrees_with_its_exact_distribution() -> None:
-    # Two runs, 0 and 1: the resampled mean is 0, 1/2 or 1 with chances 1/4, 1/2, 1/4.
-    scores = np.array([[0.0], [1.0]])
-    wide = stratified_bootstrap(scores, mean_of_tasks, generator(), confidence=0.95)
-    narrow = stratified_bootstrap(scores, mean_of_tasks, generator(), confidence=0.4)
-    assert (wide.low, wide.high, narrow.low, narrow.high) == (0.0, 1.0, 0.5, 0.5)
+    """Of four zeros and four ones the resampled sum is binomial: P(S <= 0) = 0.004, P(S <= 1) = 0.035."""
+    scores = np.repeat([0.0, 1.0], 4)[:, None]
+    found = stratified_bootstrap(scores, mean_of_tasks, generator())
+    assert (found.low, found.high) == (1.0 / 8.0, 7.0 / 8.0)
 
 
 def test_pairing_removes_what_seeds_share() -> None:

@@ -16,7 +16,7 @@ from recrl.analysis.report import table_formats
 from recrl.analysis.statistics import metrics, verdicts
 from recrl.analysis.statistics.comparisons import comparisons
 from recrl.orchestrator.files.sweep_store import SweepStore
-from tests.analysis.rows import only
+from tests.analysis.rows import ONE_COST, only
 
 
 def test_a_trial_has_three_outcomes_under_three_names(finished: Sweep) -> None:
@@ -115,7 +115,9 @@ def test_a_summary_counts_the_seeds_at_the_optimum(finished: Sweep) -> None:
     rows["optimal"], rows["feasible"] = verdicts.solved(rows), verdicts.within_limits(rows)
     found = metrics.summary(rows, finished.trials).set_index("measure").loc["stochastic"]
     assert (found["optimal_seeds"] == found["seeds"]).all()
-    table = table_formats.outcome_table(metrics.summary(rows, finished.trials), metrics.Measure.STOCHASTIC)
+    table = table_formats.outcome_table(
+        metrics.summary(rows, finished.trials), metrics.Measure.STOCHASTIC, ONE_COST
+    )
     seeds = int(found["seeds"].iloc[0])
     assert (table["solved"] == f"{seeds} of {seeds}").all()  # three seeds: no interval
 
@@ -187,7 +189,7 @@ def test_failed_trials_are_in_the_fractions_and_in_no_mean(finished: Sweep) -> N
     assert row["episode_return"] == 8.0
     gone = only(summary, task="river-a", agent="cpo", method="dynamic", measure="stochastic")
     assert (gone["seeds"], gone["failed"], gone["feasible_share"]) == (0, 3, 0.0)
-    table = table_formats.outcome_table(summary, metrics.Measure.STOCHASTIC)
+    table = table_formats.outcome_table(summary, metrics.Measure.STOCHASTIC, ONE_COST)
     shown = table[(table["task"] == "river-a") & (table["agent"] == "cpo")].set_index("curriculum")
     assert shown["failed"].to_dict() == {"none": "0", "linear": "2", "dynamic": "3"}
     assert shown["feasible"].to_dict() == {"none": "3 of 3", "linear": "1 of 3", "dynamic": "0 of 3"}
@@ -197,8 +199,8 @@ def test_failed_trials_are_in_the_fractions_and_in_no_mean(finished: Sweep) -> N
     pairs = table_formats.compared_rows(compared, summary, metrics.Measure.STOCHASTIC)
     row = only(pairs, task="river-a", agent="cpo", method="linear")
     assert (row["pairs"], row["failed"]) == (1, 2)
-    assert "failed" in table_formats.comparison_table(pairs)
-    assert "failed" not in table_formats.comparison_table(pairs.assign(failed=0))
+    assert "failed" in table_formats.comparison_table(pairs, ONE_COST)
+    assert "failed" not in table_formats.comparison_table(pairs.assign(failed=0), ONE_COST)
 
 
 def test_interquartile_means_carry_their_warning(finished: Sweep) -> None:

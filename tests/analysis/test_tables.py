@@ -15,11 +15,12 @@ from recrl.analysis.statistics.comparisons import comparisons
 from recrl.analysis.statistics.cumulative_cost import cumulative_costs
 from recrl.analysis.statistics.metrics import Measure
 from recrl.orchestrator.number_texts import number, with_error
+from tests.analysis.rows import ONE_COST
 
 
 def test_a_row_a_group_with_absolute_numbers(finished: Sweep) -> None:
     summary = metrics.summary(metrics.outcomes(finished), finished.trials)
-    table = table_formats.outcome_table(summary, Measure.STOCHASTIC)
+    table = table_formats.outcome_table(summary, Measure.STOCHASTIC, ONE_COST)
     assert len(table) == 2 * 2 * 3
     assert table.iloc[0].to_dict() == {
         "task": "river-a",
@@ -38,15 +39,17 @@ def test_a_row_a_group_with_absolute_numbers(finished: Sweep) -> None:
 
 def test_where_no_optimum_is_known_there_is_no_regret_and_nothing_solved(finished: Sweep) -> None:
     summary = metrics.summary(metrics.outcomes(finished), finished.trials)
-    known = list(table_formats.outcome_table(summary, Measure.STOCHASTIC))
-    unknown = list(table_formats.outcome_table(summary.assign(optimal_return=math.nan), Measure.STOCHASTIC))
+    known = list(table_formats.outcome_table(summary, Measure.STOCHASTIC, ONE_COST))
+    unknown = list(
+        table_formats.outcome_table(summary.assign(optimal_return=math.nan), Measure.STOCHASTIC, ONE_COST)
+    )
     assert [name for name in known if name not in unknown] == ["optimum", "regret", "solved"]
 
 
 def test_shares_have_an_interval_from_five_seeds_on_and_violators_no_regret(finished: Sweep) -> None:
     summary = metrics.summary(metrics.outcomes(finished), finished.trials)
     summary = summary.assign(seeds=5, feasible_seeds=4, optimal_seeds=5)
-    row = table_formats.outcome_table(summary, Measure.STOCHASTIC).iloc[0]
+    row = table_formats.outcome_table(summary, Measure.STOCHASTIC, ONE_COST).iloc[0]
     assert row["regret"] == "–"
     assert row["solved"].startswith("5 of 5 (")
 
@@ -55,7 +58,7 @@ def test_intervals_from_too_few_seeds_are_marked(finished: Sweep) -> None:
     rows = metrics.outcomes(finished)
     compared = comparisons(rows, np.random.default_rng(0))
     chosen = table_formats.compared_rows(compared, metrics.summary(rows, finished.trials), Measure.STOCHASTIC)
-    table = table_formats.comparison_table(chosen)
+    table = table_formats.comparison_table(chosen, ONE_COST)
     assert table["P(higher return)"].str.endswith("†").all()
     assert table["return gained"].iloc[0].startswith("15.33 [-17.65, 48.32]")
 
@@ -67,7 +70,11 @@ def test_p_values_of_gains_are_shown_where_there_are_two_seeds(finished: Sweep, 
     chosen.loc[0, "return_difference_p_corrected"] = 0.0123
     chosen.loc[1, ["return_difference_p", "return_difference_p_corrected"]] = math.nan  # of one seed
     chosen.loc[2, "feasible_pairs"] = 0
-    assert table_formats.comparison_table(chosen)["p of return, corrected"].tolist()[:3] == ["0.012", "", "–"]
+    assert table_formats.comparison_table(chosen, ONE_COST)["p of return, corrected"].tolist()[:3] == [
+        "0.012",
+        "",
+        "–",
+    ]
     _, tables = table_files.write_tables(finished, tmp_path)
     beside_none = [it for it in tables.shown if "minus none" in it.heading]
     assert len(beside_none) == 2
@@ -84,7 +91,7 @@ def test_more_return_of_an_infeasible_policy_is_no_gain_and_one_seed_has_no_mark
     chosen = table_formats.compared_rows(compared, metrics.summary(rows, finished.trials), Measure.STOCHASTIC)
     assert table_formats.row_kinds(chosen) == [""] * len(chosen)
     chosen.loc[0, ["feasible_seeds", "feasible_pairs"]] = 0
-    table = table_formats.comparison_table(chosen)
+    table = table_formats.comparison_table(chosen, ONE_COST)
     assert table_formats.row_kinds(chosen)[:2] == ["infeasible", ""]
     assert list(table[["return gained", "P(higher return)"]].iloc[0]) == ["–", "–"]
     assert table["feasible pairs"].tolist()[:2] == ["0 of 1", "1 of 1"]

@@ -307,9 +307,9 @@ def test_both_environments_draw_the_same_picture() -> None:
 
 
 def test_a_picture_shows_walls_river_goal_and_agent_where_they_are() -> None:
-    frame = render_frame(parse_map("#####\n#>~G#\n#####"), (1, 1), 0, tile_pixels=16)
-    assert frame.shape == (48, 80, 3)
-    wall, agent, river, goal = (frame[y, x] for y, x in ((8, 8), (24, 24), (24, 40), (24, 56)))
+    frame = render_frame(parse_map("#####\n#>~G#\n#####"), (1, 1), 0)
+    assert frame.shape == (96, 160, 3)
+    wall, agent, river, goal = (frame[y, x] for y, x in ((16, 16), (48, 48), (48, 80), (48, 112)))
     assert len(set(wall.tolist())) == 1
     assert agent.argmax() == 0
     assert river.argmax() == 2

@@ -51,7 +51,7 @@ def test_nothing_on_disk_is_all_new(store: SweepStore) -> None:
     plan = make_plan(SPECS, store)
     assert plan.to_do == SPECS
     assert plan.counts == {**dict.fromkeys(PlannedAction, 0), PlannedAction.NEW: 8}
-    assert plan.steps_left == 8000
+    assert [trial.steps_left for trial in plan.trials] == [1000] * 8
     assert not store.folder.exists()
 
 
@@ -70,7 +70,7 @@ def test_each_trial_gets_the_work_its_files_ask_for(store: SweepStore) -> None:
         PlannedAction.NEW,
     ]
     assert plan.to_do == (SPECS[1], SPECS[2], SPECS[4])
-    assert plan.steps_left == 600 + 700 + 1000
+    assert [trial.steps_left for trial in plan.trials] == [0, 600, 700, 0, 1000]
 
 
 def test_failed_trials_are_tried_again_only_when_asked(store: SweepStore) -> None:
