@@ -28,6 +28,7 @@ from recrl.agents.algorithms.own_options import (
     TRPOLagConfig,
 )
 from recrl.environments.cmdp import CMDPSpec
+from recrl.environments.options import validated
 from recrl.environments.plugins import WrongKindError, load_attribute, resolve
 
 
@@ -123,7 +124,7 @@ def agent_config(name: str, options: Mapping[str, Any]) -> BaseModel:
         UnknownNameError: the agent is not known.
         pydantic.ValidationError: all mistakes in the options at once.
     """
-    return find_agent(name).config.model_validate(dict(options))
+    return validated(find_agent(name).config, options)
 
 
 def make_agent(name: str, cmdp: CMDPSpec, options: Mapping[str, Any], seed: np.random.SeedSequence) -> Agent:

@@ -219,7 +219,7 @@ def load_attribute(path: str) -> Any:
     """
     module_name, _, attribute = path.partition(":")
     try:
-        return getattr(import_module(module_name), attribute)
+        module = import_module(module_name)
     except ModuleNotFoundError as error:
         if error.name != module_name.partition(".")[0]:
             raise UnknownNameError(f"cannot import {path!r}: {error}") from error
@@ -233,6 +233,10 @@ def load_attribute(path: str) -> Any:
         raise UnknownNameError(
             f"cannot import {path!r}: it ends the process (exit code {error.code})"
         ) from error
+    try:
+        return getattr(module, attribute)
+    except AttributeError as error:
+        raise UnknownNameError(f"cannot import {path!r}: {error}{nearest(attribute, dir(module))}") from error
 
 
 def trusted_attribute(path: str) -> Any:

@@ -9,6 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from recrl.environments.options import validated
 from recrl.environments.plugins import WrongKindError, resolve
 from recrl.teachers.algorithm_2 import Algorithm2Teacher
 from recrl.teachers.cooling import CoolingConfig, CoolingTeacher
@@ -143,7 +144,7 @@ def teacher_config(name: str, options: Mapping[str, Any]) -> BaseModel:
         UnknownNameError: there is no curriculum of that name.
         pydantic.ValidationError: an option is unknown or out of its range.
     """
-    return find_teacher(name).config.model_validate(dict(options))
+    return validated(find_teacher(name).config, options)
 
 
 def make_teacher(spec: TeacherSpec) -> Teacher:
@@ -152,7 +153,14 @@ def make_teacher(spec: TeacherSpec) -> Teacher:
     Raises:
         UnknownNameError: there is no curriculum of that name.
         pydantic.ValidationError: an option is unknown or out of its range.
+        TypeError: what a user's ``make`` returns is no curriculum.
     """
     kind = find_teacher(spec.name)
-    kind.config.model_validate(dict(spec.options))
-    return kind.make(spec)
+    validated(kind.config, spec.options)
+    teacher = kind.make(spec)
+    if not all(callable(getattr(teacher, method, None)) for method in ("start", "step")):
+        raise TypeError(
+            f"curriculum {spec.name}: make must return an object with the methods start and step, got "
+            f"{type(teacher).__name__}"
+        )
+    return teacher

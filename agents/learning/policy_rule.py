@@ -91,8 +91,11 @@ def united(of_rule: Mapping[str, float], common: Mapping[str, float]) -> dict[st
     """Return the metrics of a rule and those that every agent has.
 
     Raises:
+        TypeError: those of the rule are no mapping.
         ValueError: a metric of the rule has the name of another one.
     """
+    if not isinstance(of_rule, Mapping):
+        raise TypeError(f"a rule's improve must return a mapping of metrics, got {of_rule!r}")
     if taken := sorted(of_rule.keys() & common.keys()):
         raise ValueError(f"a rule's metrics need other names than the agent's own, got {', '.join(taken)}")
     return {**of_rule, **common}

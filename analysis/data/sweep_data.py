@@ -53,6 +53,7 @@ from recrl.analysis.data.optima import NO_OPTIMUM, UNKNOWN_OPTIMUM, optima_of
 from recrl.analysis.data.phase_totals import phase_totals
 from recrl.environments.cmdp import Phase
 from recrl.environments.finite.finite_cmdp import FiniteCMDP
+from recrl.environments.plugins import nearest
 from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import RecrlError, StorageError
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -257,6 +258,7 @@ def load_episodes(
 
     Raises:
         RecrlError: the sweep is from an export or from MLflow, which have no single episodes of training.
+        ValueError: there is no such column.
     """
     if isinstance(sweep, Sweep):
         if sweep.folder is None:
@@ -278,6 +280,13 @@ def load_episodes(
             episodes = episodes[episodes["phase"] == phase.value]
         return episodes if columns is None else episodes.reindex(columns=list(columns))
 
+    num_costs = max((len(spec.deploy_limits) for spec in specs), default=0)
+    known = [*EPISODE_COLUMNS, *(f"{name}_{i}" for name in ("cost", "limit") for i in range(num_costs))]
+    for column in columns or ():
+        if specs and column not in known:
+            raise ValueError(
+                f"no column {column!r}{nearest(column, known)} (episodes have {', '.join(known)})"
+            )
     keys, _ = keys_of(specs)
     return keys.put_before(
         concatenated([rows(store.trial(spec)) for spec in specs]), columns or EPISODE_COLUMNS

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
@@ -27,6 +28,7 @@ logger = logging.getLogger("recrl.sweep")
 
 PLAIN_AGENT = Choice("ppo-lag")
 CHECKED_STEPS = 16  # of a user's environment
+EPISODE_SECONDS = 2.0  # at most, of its first episode
 CHECKED_UPDATES = 200  # at most, of a curriculum of the clock
 NO_CURRICULUM, NO_LIMITS = Choice("none"), Choice("unconstrained")
 
@@ -39,7 +41,8 @@ def cmdp_of(task: Choice) -> CMDPSpec:
     """Return the task's CMDP, by building one environment; a user's environment also takes some steps.
 
     Raises:
-        BuildError: it cannot be built, fails in its first steps, or does not begin anew with a reset.
+        BuildError: it cannot be built, fails in its first episode, does not begin anew with a reset, or has
+            an episode longer than its horizon.
     """
     try:
         envs = make_vector(task.name, 1, options=task.options)
@@ -73,6 +76,28 @@ def _try_out(name: str, envs: SyncCMDPVectorEnv) -> None:
         envs.load_state_dict(envs.state_dict())
     except USERS_ERRORS as error:
         raise BuildError(f"{name} does not begin anew with a reset: {described_with_place(error)}") from error
+    try:
+        ends = _ends_in_time(envs)
+    except USERS_ERRORS as error:
+        raise BuildError(f"{name} fails in its first episode: {described_with_place(error)}") from error
+    if not ends:
+        raise BuildError(
+            f"{name} declares a horizon of {envs.cmdp.horizon} steps, but its first episode is longer; "
+            "let step return truncated=True there, or correct the attribute horizon"
+        )
+
+
+def _ends_in_time(envs: SyncCMDPVectorEnv) -> bool:
+    """Whether an episode ends within the declared horizon, as far as ``EPISODE_SECONDS`` show."""
+    if envs.cmdp.horizon is None:
+        return True
+    envs.reset(seed=0)
+    end = time.monotonic() + EPISODE_SECONDS
+    for _ in range(envs.cmdp.horizon):
+        _, _, terminated, truncated, _ = envs.step(envs.action_space.sample())
+        if terminated[0] or truncated[0] or time.monotonic() > end:
+            return True
+    return False
 
 
 def build_own(grid: GridSpec, cmdps: Mapping[str, CMDPSpec]) -> Iterator[tuple[Place, str, str]]:
@@ -160,7 +185,7 @@ def _curriculums_mistake(spec: TrialSpec, cmdp: CMDPSpec, *, is_rehearsed: bool)
 def _mistake(spec: TrialSpec) -> str:
     """Rehearse a trial; return what is wrong, or nothing."""
     from recrl.orchestrator.trial.rehearsal import (  # noqa: PLC0415  (imports torch)
-        FinalPolicyError,
+        PolicyError,
         RestartError,
         rehearse,
     )
@@ -169,8 +194,8 @@ def _mistake(spec: TrialSpec) -> str:
         rehearse(spec)
     except RestartError as error:
         return f"does not continue exactly after a restart from a checkpoint: {error}"
-    except FinalPolicyError as error:
-        return f"can learn, but its final policy fails: {error}"
+    except PolicyError as error:
+        return f"can learn, but {error}"
     except USERS_ERRORS as error:
         return f"fails in its first updates: {described_with_place(error)}"
     return ""
@@ -179,7 +204,14 @@ def _mistake(spec: TrialSpec) -> str:
 def _check_start(spec: TrialSpec, cmdp: CMDPSpec) -> None:
     """Check the first step of a trial's curriculum, and its state."""
     check = AnswerCheck(spec.method.label, cmdp.cost_names, spec.train_limits, spec.deploy_limits)
-    check.checked(make_teacher(spec.teacher).start())
+    teacher = make_teacher(spec.teacher)
+    step, _ = check.checked(teacher.start())
+    measures = isinstance(teacher, StaticTeacher) and step.start_limits is None
+    if measures and not find_teacher(spec.method.name).measures_start:
+        raise TypeError(
+            "it will measure the infinite train_limits, so its TeacherKind must have measures_start=True; or "
+            "give StaticTeacher start_fraction=0"
+        )
 
 
 def _check_decay(spec: TrialSpec, cmdp: CMDPSpec) -> None:

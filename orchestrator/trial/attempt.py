@@ -6,6 +6,7 @@ import logging
 import os
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from io import TextIOWrapper
@@ -16,7 +17,7 @@ from recrl.orchestrator.errors import (
     LostLeaseError,
     StorageError,
     TeacherUnavailableError,
-    described,
+    described_with_place,
 )
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.files.trial_writer import COMMIT_SECONDS, TrialWriter
@@ -32,6 +33,7 @@ from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import Teacher
 
 HEARTBEAT_SECONDS = 2.0
+SPEED_SECONDS = 30.0  # of updates whose mean speed is shown
 
 logger = logging.getLogger("recrl.trial")
 
@@ -71,6 +73,7 @@ def run_trial(
         while not trial.learned and not should_stop():
             with _located(f"in update {trial.update + 1}", writer):
                 trial.advance()
+            life.advanced()
             heartbeat.check()
             if time.monotonic() - committed >= commit_seconds:
                 trial.save()
@@ -96,27 +99,33 @@ class _SignsOfLife:
     def __init__(self, writer: TrialWriter) -> None:
         self._writer = writer
         self._trial: Trial | None = None
-        self._speed = 0.0
+        self._ends = deque[tuple[float, int]]()  # times of the last ends of updates, and environment steps
 
     def of(self, trial: Trial) -> Trial:
         """Set the trial once it is made; before, the heartbeat has its recorded progress."""
-        self._steps, self._since = trial.env_steps, time.monotonic()
+        self._ends.append((time.monotonic(), trial.env_steps))
         self._trial = trial
         return trial
 
+    def advanced(self) -> None:
+        """Note the end of an update of the trial."""
+        assert self._trial is not None
+        now = time.monotonic()
+        self._ends.append((now, self._trial.env_steps))
+        while len(self._ends) > 2 and self._ends[1][0] <= now - SPEED_SECONDS:
+            self._ends.popleft()
+
     def beat(self) -> None:
         """Write it."""
-        if self._trial is None:
-            before = self._writer.record
-            self._writer.heartbeat(
-                update=before.update, env_steps=before.env_steps, steps_per_second=self._speed
-            )
-            return
-        now, done = time.monotonic(), self._trial.env_steps
-        if done > self._steps:
-            self._speed = (done - self._steps) / (now - self._since)
-            self._steps, self._since = done, now
-        self._writer.heartbeat(update=self._trial.update, env_steps=done, steps_per_second=self._speed)
+        done = self._writer.record if self._trial is None else self._trial
+        self._writer.heartbeat(update=done.update, env_steps=done.env_steps, steps_per_second=self._speed())
+
+    def _speed(self) -> float:
+        """Return the steps per second over at least ``SPEED_SECONDS``, from end to end of updates."""
+        if len(self._ends) < 2:
+            return 0.0
+        (began, before), (ended, after) = self._ends[0], self._ends[-1]
+        return (after - before) / (ended - began)
 
 
 @contextmanager
@@ -202,7 +211,7 @@ def run_recorded(
                 return _close(writer, TrialStatus.WAITING)
             logger.exception("failed; rows and checkpoint end at the last commit")
             notes = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
-            text = shown(f"{described(error)}{notes}")
+            text = shown(f"{described_with_place(error)}{notes}")
             return _close(writer, TrialStatus.FAILED, error=text, traceback=shown(traceback.format_exc()))
         return store.record().status
 

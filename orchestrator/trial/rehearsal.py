@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ NOISE = 0.1
 OF_THE_CLOCK = ["time", "collect_seconds", "update_seconds"]
 
 
-class FinalPolicyError(Exception):
+class PolicyError(Exception):
     """A rehearsed agent learns, but its final policy cannot act, or noise cannot be added to its policy."""
 
 
@@ -48,7 +49,7 @@ def rehearse(spec: TrialSpec) -> None:
 
     Raises:
         RestartError: the second one fails or differs.
-        FinalPolicyError: the updates are right, but the final policy or the noise fails.
+        PolicyError: the updates are right, but the final policy or the noise fails.
         Exception: the first one fails.
     """
     num_envs, steps = min(spec.num_envs, MOST_ENVIRONMENTS), min(spec.rollout_steps, MOST_STEPS)
@@ -67,10 +68,7 @@ def rehearse(spec: TrialSpec) -> None:
         except USERS_ERRORS as error:
             raise RestartError(f"{described(error)}; {SAVED}") from error
         _compare(whole, resumed)
-        try:
-            _act(whole)
-        except USERS_ERRORS as error:
-            raise FinalPolicyError(described(error)) from error
+        _act(whole)
 
 
 def _compare(whole: TrialStore, resumed: TrialStore) -> None:
@@ -117,12 +115,27 @@ def _act(store: TrialStore) -> None:
     with open_environments(spec, 1) as environments:
         agent = make_agent(spec.agent.name, environments.cmdp, spec.agent.options, seeds.agent)
         agent.load_state_dict(_final_tree(store)["agent"])
-        policy = final_policy(agent)
         observations, _ = environments.reset(seed=0)
         generator = np.random.default_rng(seeds.exploration)
-        for actions in (policy.act(observations, generator), policy.act_greedily(observations)):
-            environments.step(environment_actions(environments.single_action_space, actions))
-        checked_noise(spec.agent.label, agent.add_noise(NOISE, observations))
+        with _saying("its final policy fails"):
+            policy = final_policy(agent)
+            for actions in (policy.act(observations, generator), policy.act_greedily(observations)):
+                environments.step(environment_actions(environments.single_action_space, actions))
+        with _saying("noise cannot be added to its policy"):
+            checked_noise(spec.agent.label, agent.add_noise(NOISE, observations))
+
+
+@contextmanager
+def _saying(what: str) -> Iterator[None]:
+    """Say what fails if the user's code does.
+
+    Raises:
+        PolicyError: it does.
+    """
+    try:
+        yield
+    except USERS_ERRORS as error:
+        raise PolicyError(f"{what}: {described(error)}") from error
 
 
 def _run(spec: TrialSpec, curriculum: TeacherSpec, folder: Path, *, restart: bool) -> TrialStore:

@@ -97,6 +97,8 @@ def test_a_rule_may_not_replace_a_metric_of_its_agent() -> None:
     assert united({"mine": 1.0}, {"kl": 0.1}) == {"mine": 1.0, "kl": 0.1}
     with pytest.raises(ValueError, match="other names than the agent's own, got kl"):
         united({"mine": 1.0, "kl": 0.0}, {"kl": 0.1})
+    with pytest.raises(TypeError, match="a rule's improve must return a mapping of metrics, got None"):
+        united(None, {"kl": 0.1})  # type: ignore[arg-type]
 
 
 @every_agent

@@ -74,6 +74,10 @@ def test_episodes_of_one_phase_and_some_columns(finished_sweep: SweepStore) -> N
     assert sweep_data.load_episodes(sweep).equals(sweep_data.load_episodes(finished_sweep))
     with pytest.raises(RecrlError, match="an export and MLflow hold no single episodes of training"):
         sweep_data.load_episodes(replace(sweep, folder=None))
+    with pytest.raises(
+        ValueError, match=r"^no column 'cost0'; did you mean 'cost_0'\? \(episodes have index, "
+    ):
+        sweep_data.load_episodes(finished_sweep, columns=["length", "cost0"])
 
 
 def test_a_running_sweep_shows_what_is_committed(made_up_sweep: Callable[..., SweepStore]) -> None:

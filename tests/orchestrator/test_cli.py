@@ -282,7 +282,8 @@ def test_failed_trials_are_named_with_their_log(
     trial = SweepStore(Path("runs"), "small").trials()[0].folder.name
     assert capsys.readouterr().out.splitlines()[-4:] == [
         "small: 0 of 1 complete, 0 running, 0 waiting, 1 failed; 0%",
-        "failed: two-state unlucky none seed 0: ArithmeticError: no luck",
+        "failed: two-state unlucky none seed 0: ArithmeticError: no luck "
+        "(my_unlucky_agent.py, line 5, in make)",
         f"        log and traceback: runs/small/trials/{trial}",
         "Try what failed again with: recrl-sweep launch grid.yaml --executor inline --no-mlflow --no-figures "
         "--only method=none --retry-failed",
@@ -298,7 +299,8 @@ def test_an_error_without_a_text_fails_its_trial(
     monkeypatch.syspath_prepend(folder)
     (folder / "grid.yaml").write_text(GRID.replace("ppo-lag", "'my_silent_agent:ENTRY'"))
     assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.TRIALS_FAILED
-    assert "none seed 0: Silent: its text cannot be read\n" in capsys.readouterr().out
+    place = "(my_silent_agent.py, line 8, in make)"
+    assert f"none seed 0: Silent: its text cannot be read {place}\n" in capsys.readouterr().out
 
 
 def test_no_password_is_printed(

@@ -616,6 +616,8 @@ class Curriculum:
         pass
     def start(self):
         return None
+    def step(self, state, report):
+        return None
 
 def make_agent(cmdp, options, seed):
     raise KeyError("momentum")
@@ -647,7 +649,7 @@ run: {total_steps: 10_000}
     assert network.startswith("grid.yaml:3: agents.0: mine cannot be built on two-state: NetworkError: ")
     assert agent == (
         "grid.yaml:3: agents.1: own_parts:AGENT cannot be built on two-state: KeyError: 'momentum' "
-        "(own_parts.py, line 16, in make_agent)"
+        "(own_parts.py, line 18, in make_agent)"
     )
     assert curriculum == (
         "grid.yaml:4: methods.1: own_parts:CURRICULUM cannot be started on two-state: TypeError: curriculum "
@@ -674,7 +676,7 @@ run: {total_steps: 10_000}
         parse_grid(data, source="grid.yaml", build=True)
     assert caught.value.problems == [
         "grid.yaml:4: agents.0: own_parts:AGENT cannot be built: KeyError: 'momentum' "
-        "(own_parts.py, line 16, in make_agent) "
+        "(own_parts.py, line 18, in make_agent) "
         "(on zebra, ant, two-state-2)",
         "grid.yaml:5: methods.0: own_parts:CURRICULUM cannot be started: TypeError: curriculum "
         "own_parts:CURRICULUM: must return a CurriculumStep and its state, a mapping, got NoneType "

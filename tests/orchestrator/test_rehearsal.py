@@ -61,6 +61,22 @@ class Broken(Room):
         return observation, reward, terminated, truncated, info if self.steps < 5 else {}
 
 
+class Endless(Room):
+    horizon = 10
+
+    def step(self, action):
+        observation, reward, _, _, info = super().step(action)
+        return observation, reward, False, False, info
+
+
+class Late(Endless):
+    def step(self, action):
+        observation, reward, *_, info = super().step(action)
+        if self.steps > 9:
+            raise OverflowError("too late")
+        return observation, reward, False, False, info
+
+
 class NoOptions(BaseModel, extra="forbid"):
     pass
 
@@ -221,14 +237,19 @@ def straight(p, train_limit, deploy_limit):
     return p * deploy_limit + (1.0 - p) * train_limit
 
 
-def decaying(decay):
+def as_text(p, train_limit, deploy_limit):
+    return str(train_limit)
+
+
+def decaying(decay, measures_start=True):
     make = lambda spec: StaticTeacher(spec, decay=decay)
-    return TeacherKind(decay.__name__, NoOptions, make, measures_start=True)
+    return TeacherKind(decay.__name__, NoOptions, make, measures_start=measures_start)
 
 
 KINDS = (Staircase, TooLow, NoStep, Long)
 STAIRCASE, TOO_LOW, NO_STEP, LONG = (TeacherKind(kind.__name__, NoOptions, kind) for kind in KINDS)
-TOO_LOW_LATER, RISING, STRAIGHT = map(decaying, (too_low_later, rising, straight))
+TOO_LOW_LATER, RISING, STRAIGHT, AS_TEXT = map(decaying, (too_low_later, rising, straight, as_text))
+UNDECLARED = decaying(straight, measures_start=False)
 '''
 
 
@@ -286,6 +307,20 @@ def test_a_task_that_fails_after_its_first_step() -> None:
     assert "cost" in problem
 
 
+def test_a_task_whose_episode_is_longer_than_its_horizon() -> None:
+    (problem,) = problems(task="own_rehearsed:Endless")
+    assert problem == (
+        "grid.yaml:2: tasks.0: own_rehearsed:Endless declares a horizon of 10 steps, but its first episode "
+        "is longer; let step return truncated=True there, or correct the attribute horizon"
+    )
+
+
+def test_a_task_that_fails_later_in_its_first_episode() -> None:
+    (problem,) = problems(task="own_rehearsed:Late")
+    assert problem.startswith("grid.yaml:2: tasks.0: own_rehearsed:Late fails in its first ")
+    assert "OverflowError: too late (own_rehearsed.py, line " in problem
+
+
 def test_an_error_in_own_code_says_where_it_was_raised() -> None:
     """The place is the last one that is neither in recrl nor installed: not NumPy's below it."""
     (problem,) = problems(agents=["own_rehearsed:FALLING"])
@@ -308,7 +343,7 @@ def test_an_error_in_own_code_says_where_it_was_raised() -> None:
             "LIMITED",
             "without limits fails in its first updates: OverflowError: cannot convert float infinity ",
         ),
-        ("NO_NOISE", "can learn, but its final policy fails: NotImplementedError"),
+        ("NO_NOISE", "can learn, but noise cannot be added to its policy: NotImplementedError"),
         ("ODD_NOISE", ": add_noise must not name update; the event has these keys"),
         ("LISTED", "an agent's state_dict must return a dict, got list"),
         (
@@ -343,18 +378,32 @@ def test_an_agent_that_meets_a_curriculum_which_rewards_entropy() -> None:
     [
         ("STAIRCASE", "does not continue exactly after a restart from a checkpoint: ValueError: curriculum "),
         ("TOO_LOW", "the limit of wear is 0.5 after update 1, below its deploy_limits of 2"),
-        ("NO_STEP", "AttributeError: 'NoStep' object has no attribute 'step'"),
+        (
+            "NO_STEP",
+            "cannot be started on two-state: TypeError: curriculum own_rehearsed:NO_STEP: make must ",
+        ),
     ],
 )
 def test_a_curriculum(curriculum: str, sentence: str) -> None:
     (problem,) = problems(methods=[f"own_rehearsed:{curriculum}"])
-    assert problem.startswith(f"grid.yaml:4: methods.0: own_rehearsed:{curriculum} on two-state ")
+    assert problem.startswith(f"grid.yaml:4: methods.0: own_rehearsed:{curriculum} ")
     assert sentence in problem
+
+
+def test_a_decay_that_does_not_declare_its_measurement() -> None:
+    (problem,) = problems(methods=["own_rehearsed:UNDECLARED"], train_limits="auto")
+    assert problem == (
+        "grid.yaml:4: methods.0: own_rehearsed:UNDECLARED cannot be started on two-state: TypeError: it will "
+        "measure the infinite train_limits, so its TeacherKind must have measures_start=True; or give "
+        "StaticTeacher start_fraction=0"
+    )
+    assert problems(methods=["own_rehearsed:UNDECLARED"], train_limits="5") == []
 
 
 @pytest.mark.parametrize(
     ("curriculum", "sentence"),
     [
+        ("AS_TEXT", "TypeError: the decay must return a number, got '5.0' at progress"),
         ("TOO_LOW_LATER", "the decay must be between d_d = 2 and d_t = 5, got 0.5 at progress 0.5"),
         ("RISING", "curriculum own_rehearsed:RISING: the limit of wear rose from 2"),
     ],
@@ -365,6 +414,6 @@ def test_a_decay_is_checked_up_to_its_end(
 ) -> None:
     of = partial(problems, train_limits=train_limits, total_steps=total_steps)
     (problem,) = of(methods=[f"own_rehearsed:{curriculum}"])
-    assert f"own_rehearsed:{curriculum} fails later in training on two-state: ValueError: " in problem
+    assert f"own_rehearsed:{curriculum} fails later in training on two-state: " in problem
     assert sentence in problem
     assert of(methods=["own_rehearsed:STRAIGHT"]) == []

@@ -167,7 +167,10 @@ def test_one_trial_that_fails_leaves_the_others_alone(
     result = _launch(store, grid)
     assert [trial.spec.agent.label for trial in result.failed] == ["fragile"]
     record, files = result.failed[0].record, store.trial(result.failed[0].spec)
-    assert record.error.startswith("ArithmeticError: the policy is no longer finite (in update 1")
+    assert record.error == (
+        "ArithmeticError: the policy is no longer finite (my_fragile_agent.py, line 12, in update) "
+        "(in update 1; no checkpoint before it)"
+    )
     assert "Traceback" in files.error_path.read_text()
     assert [trial.record.status for trial in result.progress.trials] == [
         TrialStatus.FAILED,

@@ -27,7 +27,7 @@ from recrl.environments.vector import CMDPVectorEnv
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.spec import Choice, TrialSpec, TrialStatus
-from recrl.orchestrator.trial import trial
+from recrl.orchestrator.trial import attempt, trial
 from recrl.orchestrator.trial.attempt import run_recorded
 from recrl.orchestrator.trial.trial import Trial
 from recrl.teachers.registry import TEACHERS, TeacherKind, make_teacher
@@ -525,3 +525,21 @@ def test_a_trial_that_raises_is_failed_with_its_traceback(tmp_path: Path) -> Non
 
 def test_the_run_says_what_it_was_made_of(undisturbed: TrialStore) -> None:
     assert '"torch"' in undisturbed.provenance_path.read_text()
+
+
+def test_the_speed_is_that_of_whole_updates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Updates of 440 steps take 1.1 seconds, the last one 9.9; a beat comes some time after each."""
+    clock, running, writer = SimpleNamespace(now=0.0), SimpleNamespace(update=0, env_steps=0), Mock()
+    monkeypatch.setattr(attempt, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    life = attempt._SignsOfLife(writer)
+    life.of(running)  # type: ignore[arg-type]
+    speeds = []
+    for number in range(1, 102):
+        clock.now = 1.1 * number if number <= 100 else 110.0 + 9.9
+        running.env_steps += 440
+        life.advanced()
+        clock.now += 0.3 * (number % 3)
+        life.beat()
+        speeds.append(writer.heartbeat.call_args.kwargs["steps_per_second"])
+    assert speeds[:100] == pytest.approx([400.0] * 100)
+    assert speeds[100] == pytest.approx(440 * 20 / 30.8)  # of at least 30 seconds
