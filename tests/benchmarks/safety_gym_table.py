@@ -97,7 +97,7 @@ def write_rows_and_tests(archives: Mapping[str, Path]) -> None:
         for tests in (1, 24)
     ]
     (RESULTS / "power.txt").write_text(transcript(powers, ROOT))
-    for name in (*CONFIRMATIONS, LEVEL_1):
+    for name in (*CONFIRMATIONS, LEVEL_1, LONG):
         earlier = " ".join(f"results/safety-gym/{it}" for it in CONFIRMATIONS.get(name, ()))
         before = f" --earlier {earlier}" if earlier else ""
         judge = f"-m tests.benchmarks.confirmations results/safety-gym/{name}.csv{before}"
