@@ -27,7 +27,7 @@ class Constraints:
         limits: d, [k], possibly infinite.
         gaps: constrained value (the mean undiscounted episode cost, or its CVaR) minus limit, [k]; -inf where
             the limit is infinite.
-        standard_errors: of the constrained values, [k], at least 0; 0 until two episodes have finished.
+        standard_errors: of the constrained values, [k], at least 0; 0 if there are fewer than two episodes.
         episode_length: mean steps of an episode, at least 1.
     """
 

@@ -28,7 +28,7 @@ from recrl.agents.algorithms.own_options import (
     TRPOLagConfig,
 )
 from recrl.environments.cmdp import CMDPSpec
-from recrl.environments.options import validated
+from recrl.environments.options import require_model
 from recrl.environments.plugins import WrongKindError, load_attribute, resolve
 
 
@@ -45,6 +45,9 @@ class AgentEntry:
     summary: str
     config: type[BaseModel]
     make: str | Callable[[CMDPSpec, Any, np.random.SeedSequence], Agent]
+
+    def __post_init__(self) -> None:
+        require_model(self.config)
 
 
 AGENTS: dict[str, AgentEntry] = {
@@ -124,7 +127,7 @@ def agent_config(name: str, options: Mapping[str, Any]) -> BaseModel:
         UnknownNameError: the agent is not known.
         pydantic.ValidationError: all mistakes in the options at once.
     """
-    return validated(find_agent(name).config, options)
+    return find_agent(name).config.model_validate(dict(options))
 
 
 def make_agent(name: str, cmdp: CMDPSpec, options: Mapping[str, Any], seed: np.random.SeedSequence) -> Agent:

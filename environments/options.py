@@ -1,8 +1,7 @@
-"""The base of all options that a grid gives to a task, an agent or a curriculum, and how they are read."""
+"""The base of all options that a grid gives to a task, an agent or a curriculum."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator
@@ -38,16 +37,11 @@ def _parts(annotation: Any) -> list[Any]:
     return [part for each in arguments for part in _parts(each)] if arguments else [annotation]
 
 
-def validated(model: type[BaseModel], options: Mapping[str, Any]) -> BaseModel:
-    """Return options as an instance of a model, also of a user's; its ``model_dump`` has the defaults.
-
-    A key that is no field is a mistake, unless the model allows extra keys. Pydantic alone would ignore it.
+def require_model(config: object) -> None:
+    """Check that an entry of a registry, possibly a user's, has a model of options.
 
     Raises:
-        TypeError: the model is no pydantic model.
-        pydantic.ValidationError: all mistakes in the options at once.
+        TypeError: it is no pydantic model.
     """
-    if not (isinstance(model, type) and issubclass(model, BaseModel)):
-        raise TypeError(f"the options must have a pydantic model, a subclass of BaseModel, got {model!r}")
-    allows_more = model.model_config.get("extra") == "allow"
-    return model.model_validate(dict(options), extra=None if allows_more else "forbid")
+    if not (isinstance(config, type) and issubclass(config, BaseModel)):
+        raise TypeError(f"config must be a pydantic model, a subclass of BaseModel, got {config!r}")

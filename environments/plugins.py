@@ -219,7 +219,7 @@ def load_attribute(path: str) -> Any:
     """
     module_name, _, attribute = path.partition(":")
     try:
-        module = import_module(module_name)
+        return getattr(import_module(module_name), attribute)
     except ModuleNotFoundError as error:
         if error.name != module_name.partition(".")[0]:
             raise UnknownNameError(f"cannot import {path!r}: {error}") from error
@@ -228,15 +228,13 @@ def load_attribute(path: str) -> Any:
             "holds it, name that folder in PYTHONPATH, or install the module's package"
         ) from error
     except (ImportError, AttributeError) as error:
-        raise UnknownNameError(f"cannot import {path!r}: {error}") from error
+        module = sys.modules.get(module_name)  # None if the import itself failed
+        hint = nearest(attribute, dir(module)) if module else ""
+        raise UnknownNameError(f"cannot import {path!r}: {error}{hint}") from error
     except SystemExit as error:
         raise UnknownNameError(
             f"cannot import {path!r}: it ends the process (exit code {error.code})"
         ) from error
-    try:
-        return getattr(module, attribute)
-    except AttributeError as error:
-        raise UnknownNameError(f"cannot import {path!r}: {error}{nearest(attribute, dir(module))}") from error
 
 
 def trusted_attribute(path: str) -> Any:

@@ -20,7 +20,6 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict
 
 from recrl.environments.cmdp import CostLimits
-from recrl.environments.options import validated
 from recrl.environments.plugins import WrongKindError, load_attribute, resolve
 from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 from recrl.environments.vector import CMDPVectorEnv
@@ -171,7 +170,7 @@ def task_options(name: str, options: Mapping[str, Any]) -> BaseModel:
         UnknownNameError: the task is not known.
         pydantic.ValidationError: all mistakes in the options at once.
     """
-    return validated(options_model(name), options)
+    return options_model(name).model_validate(dict(options))
 
 
 def options_model(name: str) -> type[BaseModel]:

@@ -99,6 +99,20 @@ def sentences(error: ValidationError, model: type[BaseModel] | None) -> Iterator
             yield place, f"{item['msg'][:1].lower()}{item['msg'][1:]}, got {values['given']}"
 
 
+def ignored_keys(model: BaseModel, given: Mapping[str, Any]) -> Iterator[tuple[Place, str]]:
+    """Yield the keys that validation ignored, with a sentence, unless the model says what to do with them.
+
+    Args:
+        model: what became of the value.
+        given: the value.
+    """
+    if "extra" in model.model_config or len(model.model_fields_set) == len(given):
+        return
+    known = list(type(model).model_fields)
+    names = {*known, *(field.alias for field in type(model).model_fields.values())}
+    yield from (((key,), _unknown_key(key, known)) for key in given if key not in names)
+
+
 def known_keys(model: type[BaseModel] | None, place: Place) -> list[str]:
     """Return the allowed keys at ``place`` inside a value of ``model``; [] if unknown."""
     for part in place:

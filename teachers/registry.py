@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from recrl.environments.options import validated
+from recrl.environments.options import require_model
 from recrl.environments.plugins import WrongKindError, resolve
 from recrl.teachers.algorithm_2 import Algorithm2Teacher
 from recrl.teachers.cooling import CoolingConfig, CoolingTeacher
@@ -56,6 +56,9 @@ class TeacherKind:
     compares_costs: bool = False
     rewards_entropy: bool = False
     is_control: bool = False
+
+    def __post_init__(self) -> None:
+        require_model(self.config)
 
 
 def _decay(summary: str, decay: Decay) -> TeacherKind:
@@ -144,7 +147,7 @@ def teacher_config(name: str, options: Mapping[str, Any]) -> BaseModel:
         UnknownNameError: there is no curriculum of that name.
         pydantic.ValidationError: an option is unknown or out of its range.
     """
-    return validated(find_teacher(name).config, options)
+    return find_teacher(name).config.model_validate(dict(options))
 
 
 def make_teacher(spec: TeacherSpec) -> Teacher:
@@ -156,7 +159,7 @@ def make_teacher(spec: TeacherSpec) -> Teacher:
         TypeError: what a user's ``make`` returns is no curriculum.
     """
     kind = find_teacher(spec.name)
-    validated(kind.config, spec.options)
+    kind.config.model_validate(dict(spec.options))
     teacher = kind.make(spec)
     if not all(callable(getattr(teacher, method, None)) for method in ("start", "step")):
         raise TypeError(

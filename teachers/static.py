@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from numbers import Real
 
 from pydantic import Field
 
@@ -72,7 +71,7 @@ def limit_at(p: float, train_limit: float, deploy_limit: float, decay: Decay) ->
     d_d is corrected.
 
     Raises:
-        TypeError: the decay is no number.
+        TypeError: the decay is text.
         ValueError: the decay is not within d_d and d_t.
     """
     if p >= 1.0 or train_limit == deploy_limit:
@@ -80,7 +79,7 @@ def limit_at(p: float, train_limit: float, deploy_limit: float, decay: Decay) ->
     if math.isinf(train_limit):
         return math.inf
     limit = decay(p, train_limit, deploy_limit)
-    if not isinstance(limit, Real):
+    if isinstance(limit, str):
         raise TypeError(f"the decay must return a number, got {limit!r} at progress {p:g}")
     within = min(max(limit, deploy_limit), train_limit)
     if not math.isclose(limit, within, rel_tol=1e-9, abs_tol=1e-9):

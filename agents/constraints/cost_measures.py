@@ -263,7 +263,7 @@ class TailCost:
     def measure(self, rollout: Rollout, episodes: Episodes, limits: Floats) -> MeasuredCosts:
         """Return the tail costs, and the CVaR if it is within the limit, else a bound on it.
 
-        Until a first episode has finished, those under way count as if they had. Their CVaR is too low.
+        Until a first episode has finished, those under way count as if they had. Their costs are too low.
 
         Args:
             rollout: the steps.

@@ -270,6 +270,8 @@ def load_episodes(
     else:
         store, specs = sweep, sweep.specs()
 
+    chosen = None if columns is None else [column for column in columns if column not in KEY]
+
     def rows(trial: TrialReader) -> pd.DataFrame:
         try:
             episodes = trial.episodes()
@@ -278,18 +280,19 @@ def load_episodes(
             return pd.DataFrame()
         if phase is not None and len(episodes):
             episodes = episodes[episodes["phase"] == phase.value]
-        return episodes if columns is None else episodes.reindex(columns=list(columns))
+        return episodes if chosen is None else episodes.reindex(columns=chosen)
 
     num_costs = max((len(spec.deploy_limits) for spec in specs), default=0)
     known = [*EPISODE_COLUMNS, *(f"{name}_{i}" for name in ("cost", "limit") for i in range(num_costs))]
-    for column in columns or ():
+    for column in chosen or ():
         if specs and column not in known:
             raise ValueError(
                 f"no column {column!r}{nearest(column, known)} (episodes have {', '.join(known)})"
             )
     keys, _ = keys_of(specs)
     return keys.put_before(
-        concatenated([rows(store.trial(spec)) for spec in specs]), columns or EPISODE_COLUMNS
+        concatenated([rows(store.trial(spec)) for spec in specs]),
+        EPISODE_COLUMNS if chosen is None else chosen,
     )
 
 

@@ -28,7 +28,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.only_selection import parse_only, select
 from recrl.orchestrator.spec import Choice, TrialStatus
-from recrl.orchestrator.validation_sentences import NotJsonError, require_json, sentences
+from recrl.orchestrator.validation_sentences import NotJsonError, ignored_keys, require_json, sentences
 from recrl.teachers.registry import find_teacher, teacher_config
 
 if TYPE_CHECKING:
@@ -172,7 +172,9 @@ def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
     try:
         options = {**(_beside_preset(method) if "preset" in changed else method.options), **changed}
         require_json(options)
-        teacher_config(method.name, options)
+        config = teacher_config(method.name, options)
+        for place, sentence in ignored_keys(config, options):
+            raise RecrlError(f"--option: {method.name}: {'.'.join(map(str, place))}: {sentence}")
     except ValidationError as error:
         mistakes = list(sentences(error, find_teacher(method.name).config))
         text = "; ".join(f"{'.'.join(map(str, place))}: {sentence}" for place, sentence in mistakes)

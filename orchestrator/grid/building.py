@@ -205,8 +205,8 @@ def _check_start(spec: TrialSpec, cmdp: CMDPSpec) -> None:
     """Check the first step of a trial's curriculum, and its state."""
     check = AnswerCheck(spec.method.label, cmdp.cost_names, spec.train_limits, spec.deploy_limits)
     teacher = make_teacher(spec.teacher)
-    step, _ = check.checked(teacher.start())
-    measures = isinstance(teacher, StaticTeacher) and step.start_limits is None
+    _, state = check.checked(teacher.start())
+    measures = isinstance(teacher, StaticTeacher) and state.get("start_limits", ()) is None
     if measures and not find_teacher(spec.method.name).measures_start:
         raise TypeError(
             "it will measure the infinite train_limits, so its TeacherKind must have measures_start=True; or "

@@ -48,6 +48,7 @@ from recrl.orchestrator.untrusted import as_seen
 from recrl.orchestrator.validation_sentences import (
     NotJsonError,
     as_written,
+    ignored_keys,
     misspells,
     require_json,
     sentences,
@@ -268,6 +269,11 @@ class _Check:
             require_json(entry.options)  # of an untyped option, model_dump writes an infinite number as null
             options = model.model_dump(mode="json")
             require_json(options)
+            if not _reads_back(entry.name, options, options_of):
+                raise TypeError(
+                    "its model of options must accept what its model_dump returns, and give it again; "
+                    "a field with an alias needs populate_by_name=True"
+                )
         except ValidationError as error:
             for inner, sentence in sentences(error, _model_of(entry.name, options_of)):
                 self.problems.add((*place, "options", *inner), sentence)
@@ -280,6 +286,8 @@ class _Check:
         except USERS_ERRORS as error:
             self.problems.add(name_place, f"{entry.name!r} cannot be used: {described(error)}")
         else:
+            for inner, sentence in ignored_keys(model, entry.options):
+                self.problems.add((*place, "options", *inner), sentence)
             self._check_network((*place, "options", "network"), options)
             return options
         return None
@@ -388,6 +396,14 @@ def _named(value: Any) -> Any:
     return (
         {key: value[key] for key in ("name", "options") if key in value} if isinstance(value, dict) else value
     )
+
+
+def _reads_back(name: str, options: Mapping[str, Any], options_of: OptionsOf) -> bool:
+    """Whether options with their defaults, as a trial stores them, are read again as they are."""
+    try:
+        return options_of(name, options).model_dump(mode="json") == options
+    except ValidationError:
+        return False
 
 
 def _model_of(name: str, options_of: OptionsOf) -> type[BaseModel] | None:

@@ -7,9 +7,11 @@ import pytest
 from pydantic import ValidationError
 
 from recrl.agents.algorithms.own_options import CPOConfig, PPOLagConfig
-from recrl.agents.registry import AGENTS, agent_config, find_agent
+from recrl.agents.registry import AGENTS, AgentEntry, agent_config, find_agent
 from recrl.agents.shared_options import ActorCriticConfig
 from recrl.environments.plugins import UnknownNameError
+from recrl.teachers.registry import TeacherKind
+from recrl.teachers.static import none_teacher
 
 
 def test_validating_options_imports_no_torch() -> None:
@@ -79,3 +81,10 @@ def test_all_mistakes_are_reported_at_once() -> None:
 def test_softplus_cannot_begin_at_zero() -> None:
     with pytest.raises(ValidationError, match=r"must be above 0 with the rule softplus-adam, got 0\.0"):
         agent_config("ppo-lag", {"multiplier_rule": "softplus-adam", "multiplier_initial": 0.0})
+
+
+def test_an_entry_needs_a_model_of_options() -> None:
+    with pytest.raises(TypeError, match=r"^config must be a pydantic model, .*, got <class 'dict'>$"):
+        AgentEntry("Mine.", dict, "mine:make")  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="^config must be a pydantic model"):
+        TeacherKind("Mine.", {}, none_teacher)  # type: ignore[arg-type]

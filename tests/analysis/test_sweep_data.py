@@ -78,6 +78,8 @@ def test_episodes_of_one_phase_and_some_columns(finished_sweep: SweepStore) -> N
         ValueError, match=r"^no column 'cost0'; did you mean 'cost_0'\? \(episodes have index, "
     ):
         sweep_data.load_episodes(finished_sweep, columns=["length", "cost0"])
+    chosen = sweep_data.load_episodes(finished_sweep, columns=["seed", "length"])
+    assert list(chosen.columns) == [*KEY, "length"]
 
 
 def test_a_running_sweep_shows_what_is_committed(made_up_sweep: Callable[..., SweepStore]) -> None:

@@ -7,7 +7,8 @@ The tables are those of ``final_policies.py``; the first one's name says which r
 conditions of the rule, for ppo-lag's final stochastic policies. Then come the differences of linear from
 none in return and cost, with 95% intervals, paired (Student) and as two groups (Welch): of these seeds, of
 these with the first earlier table if there is one, and of all. A table whose seeds suggested the question
-comes last.
+comes last. With ``--shorter``, a table of trials with fewer steps and other seeds, each curriculum is
+compared with itself after fewer steps. That was not planned.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from pathlib import Path
 import pandas as pd
 
 from recrl.analysis.statistics.intervals import Difference, group_difference, paired_difference
+from tests.benchmarks.differences import weighted_sum
 from tests.benchmarks.velocity_table import Cell
 
 AGENT, LIMIT, METHODS = "ppo-lag", 25.0, ["none", "linear"]
@@ -102,6 +104,15 @@ def intervals(seeds: pd.DataFrame) -> Iterator[str]:
         yield f"  {column}: {paired.estimate:.2f} ({both})"
 
 
+def from_shorter(seeds: pd.DataFrame, shorter: pd.DataFrame) -> Iterator[str]:
+    """Yield how policies after more steps differ from those after fewer steps, with other seeds."""
+    for column in ("return", "cost"):
+        groups = [of[column, method].to_numpy() for method in reversed(METHODS) for of in (seeds, shorter)]
+        for method, pair in zip(reversed(METHODS), (groups[:2], groups[2:]), strict=True):
+            yield f"  {column} under {method}: {weighted_sum(pair, [1.0, -1.0])}"
+        yield f"  {column}, linear minus none: {weighted_sum(groups, [1.0, -1.0, -1.0, 1.0])}"
+
+
 def kept(seeds: pd.DataFrame) -> pd.DataFrame:
     """Return the pairs whose policy under none keeps the limit."""
     return seeds[seeds["cost", "none"] <= LIMIT + seeds["cost_se", "none"]]
@@ -114,6 +125,7 @@ def main() -> None:
     )
     parser.add_argument("fresh", type=Path)
     parser.add_argument("--earlier", type=Path, nargs="+", default=[])
+    parser.add_argument("--shorter", type=Path)
     given = parser.parse_args()
     fresh = pd.read_csv(given.fresh)
     if (rule := RULES.get(given.fresh.stem)) is None:
@@ -131,6 +143,13 @@ def main() -> None:
             if 1 < len(within) < len(seeds):
                 print(f" of these, where none keeps the limit, seeds {', '.join(map(str, within.index))}:")
                 print("\n".join(intervals(within)))
+        if given.shorter:
+            rows = pd.read_csv(given.shorter)
+            shorter = pairs(rows[rows["agent"] == AGENT], policy)
+            print(
+                f"{policy}, these seeds minus seeds {', '.join(map(str, shorter.index))} after fewer steps:"
+            )
+            print("\n".join(from_shorter(pairs(of_question.loc[[0]], policy), shorter)))
 
 
 if __name__ == "__main__":

@@ -75,20 +75,30 @@ def differences_from(
 
 
 def average(rows: pd.DataFrame, control: pd.DataFrame, column: str) -> str:
-    """The mean of the tasks' differences; the tasks are fixed, the seeds random.
-
-    The interval is Welch's for a sum of independent means, with Satterthwaite's degrees of freedom.
-    """
+    """The mean of the tasks' differences; the tasks are fixed, the seeds random."""
     pairs = [
         (group[column].to_numpy(), control.loc[control["task"] == task, column].to_numpy())
         for task, group in rows.groupby("task")
     ]
-    groups = [each for pair in pairs for each in pair]
-    parts = np.array([each.var(ddof=1) / len(each) for each in groups])
+    return weighted_sum(
+        [each for pair in pairs for each in pair], [1.0 / len(pairs), -1.0 / len(pairs)] * len(pairs)
+    )
+
+
+def weighted_sum(groups: Sequence[Floats], weights: Sequence[float]) -> str:
+    """The weighted sum of the means of independent groups, with Welch's interval.
+
+    The degrees of freedom are Satterthwaite's.
+
+    >>> weighted_sum([np.array([1.0, 2.0, 3.0]), np.array([4.0, 6.0])], [1.0, -1.0])
+    '-3.00 (-8.98 to 2.98; 1.7 degrees of freedom)'
+    """
+    errors = [weight**2 * each.var(ddof=1) / len(each) for each, weight in zip(groups, weights, strict=True)]
+    parts = np.array(errors)
     degrees = parts.sum() ** 2 / (parts**2 / np.array([len(each) - 1 for each in groups])).sum()
-    mean = float(np.mean([values.mean() - base.mean() for values, base in pairs]))
-    reach = math.sqrt(parts.sum()) / len(pairs) * float(stats.t.ppf(0.5 + 0.5 * CONFIDENCE, degrees))
-    return f"{mean:.2f} ({mean - reach:.2f} to {mean + reach:.2f}; {degrees:.1f} degrees of freedom)"
+    total = float(sum(weight * each.mean() for each, weight in zip(groups, weights, strict=True)))
+    reach = math.sqrt(parts.sum()) * float(stats.t.ppf(0.5 + 0.5 * CONFIDENCE, degrees))
+    return f"{total:.2f} ({total - reach:.2f} to {total + reach:.2f}; {degrees:.1f} degrees of freedom)"
 
 
 def main() -> None:

@@ -100,6 +100,7 @@ def write_rows_and_tests(archives: Mapping[str, Path]) -> None:
     for name in (*CONFIRMATIONS, LEVEL_1, LONG):
         earlier = " ".join(f"results/safety-gym/{it}" for it in CONFIRMATIONS.get(name, ()))
         before = f" --earlier {earlier}" if earlier else ""
+        before += " --shorter results/safety-gym/goal-confirm.csv" if name == LONG else ""
         judge = f"-m tests.benchmarks.confirmations results/safety-gym/{name}.csv{before}"
         (RESULTS / f"{name}.txt").write_text(transcript([judge], ROOT))
 

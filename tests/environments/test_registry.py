@@ -15,7 +15,6 @@ from pydantic import BaseModel, ValidationError
 
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
-from recrl.environments.options import validated
 from recrl.environments.plugins import MODULES, UnknownNameError, load_attribute, modules_in
 from recrl.environments.registry import TASKS, find_task, make_vector, optimal_return, task_options
 from recrl.environments.rivergrid.maps import MAPS, parse_map
@@ -246,25 +245,6 @@ def test_what_is_neither_a_task_nor_callable_is_refused() -> None:
         ValueError, match=r"task 'math:pi' must be a Task or return an environment, got float"
     ):
         find_task("math:pi")
-
-
-class Loose(BaseModel):
-    power: float = 1.0
-
-
-class Open(Loose, extra="allow"):
-    pass
-
-
-def test_an_unknown_option_of_any_model_is_a_mistake() -> None:
-    assert validated(Loose, {"power": 2.0}).model_dump() == {"power": 2.0}
-    with pytest.raises(ValidationError, match="Extra inputs are not permitted"):
-        validated(Loose, {"pwer": 2.0})
-    assert validated(Open, {"pwer": 2.0}).model_dump() == {"power": 1.0, "pwer": 2.0}
-    with pytest.raises(
-        TypeError, match=r"must have a pydantic model, a subclass of BaseModel, got <class 'dict'>"
-    ):
-        validated(dict, {})  # type: ignore[arg-type]
 
 
 def test_a_misspelt_attribute_of_a_module_is_met_with_the_nearest() -> None:

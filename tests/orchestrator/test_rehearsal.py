@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,7 +13,7 @@ from recrl.orchestrator.grid.checking import parse_grid
 OWN = '''\
 import gymnasium
 import numpy as np
-from pydantic import BaseModel
+from pydantic import BaseModel, Field, computed_field
 
 from recrl.agents.algorithms.ppo import make_ppo
 from recrl.agents.registry import AGENTS, AgentEntry
@@ -70,15 +71,39 @@ class Endless(Room):
 
 
 class Late(Endless):
+    horizon = 30
+
     def step(self, action):
         observation, reward, *_, info = super().step(action)
-        if self.steps > 9:
+        if self.steps > 20:
             raise OverflowError("too late")
         return observation, reward, False, False, info
 
 
 class NoOptions(BaseModel, extra="forbid"):
     pass
+
+
+class Inner(BaseModel, extra="allow"):
+    size: float = 1.0
+
+
+class Loose(BaseModel):
+    power: float = 1.0
+    inner: Inner = Inner()
+
+    @computed_field
+    @property
+    def squared(self) -> float:
+        return self.power**2
+
+
+class Strict(Loose, extra="forbid"):
+    pass
+
+
+class Renamed(BaseModel):
+    step_size: float = Field(1.0, alias="stepSize")
 
 
 class Wrapped:
@@ -250,6 +275,23 @@ KINDS = (Staircase, TooLow, NoStep, Long)
 STAIRCASE, TOO_LOW, NO_STEP, LONG = (TeacherKind(kind.__name__, NoOptions, kind) for kind in KINDS)
 TOO_LOW_LATER, RISING, STRAIGHT, AS_TEXT = map(decaying, (too_low_later, rising, straight, as_text))
 UNDECLARED = decaying(straight, measures_start=False)
+LOOSE, STRICT, RENAMED = (
+    TeacherKind(kind.__name__, kind, lambda spec: StaticTeacher(spec, decay=straight), measures_start=True)
+    for kind in (Loose, Strict, Renamed)
+)
+
+
+class Stepping(StaticTeacher):
+    """Measures nothing, and has its own start."""
+
+    def start(self):
+        return CurriculumStep(self.spec.train_limits), {"update": 0}
+
+    def step(self, state, report):
+        return CurriculumStep(self.spec.deploy_limits), {"update": report.update}
+
+
+STEPPING = TeacherKind("Stepping", NoOptions, lambda spec: Stepping(spec, decay=straight))
 '''
 
 
@@ -262,7 +304,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def problems(
     task: str = "two-state",
     agents: Sequence[str] = ("cpo",),
-    methods: Sequence[str] = ("none",),
+    methods: Sequence[str | dict[str, Any]] = ("none",),
     train_limits: str = "5",
     total_steps: int = 10_000,
 ) -> list[str]:
@@ -317,7 +359,7 @@ def test_a_task_whose_episode_is_longer_than_its_horizon() -> None:
 
 def test_a_task_that_fails_later_in_its_first_episode() -> None:
     (problem,) = problems(task="own_rehearsed:Late")
-    assert problem.startswith("grid.yaml:2: tasks.0: own_rehearsed:Late fails in its first ")
+    assert problem.startswith("grid.yaml:2: tasks.0: own_rehearsed:Late fails in its first episode: ")
     assert "OverflowError: too late (own_rehearsed.py, line " in problem
 
 
@@ -390,6 +432,25 @@ def test_a_curriculum(curriculum: str, sentence: str) -> None:
     assert sentence in problem
 
 
+@pytest.mark.parametrize(
+    ("options", "sentences"),
+    [
+        ({"power": 2, "inner": {"b": 2}}, []),
+        ({"pwer": 2}, ["grid.yaml:4: methods.0.options.pwer: unknown key; did you mean 'power'?"]),
+    ],
+)
+def test_an_option_that_a_model_would_ignore(options: dict[str, Any], sentences: list[str]) -> None:
+    """Nested models and computed fields are the model's own matter."""
+    assert problems(methods=[{"name": "own_rehearsed:LOOSE", "options": options}]) == sentences
+
+
+@pytest.mark.parametrize(("kind", "options"), [("RENAMED", {"stepSize": 2}), ("STRICT", {"power": 2})])
+def test_options_that_cannot_be_read_back(kind: str, options: dict[str, Any]) -> None:
+    (problem,) = problems(methods=[{"name": f"own_rehearsed:{kind}", "options": options}])
+    assert f"methods.0.name: 'own_rehearsed:{kind}' cannot be used: TypeError: its model of " in problem
+    assert problem.endswith("a field with an alias needs populate_by_name=True")
+
+
 def test_a_decay_that_does_not_declare_its_measurement() -> None:
     (problem,) = problems(methods=["own_rehearsed:UNDECLARED"], train_limits="auto")
     assert problem == (
@@ -398,6 +459,7 @@ def test_a_decay_that_does_not_declare_its_measurement() -> None:
         "StaticTeacher start_fraction=0"
     )
     assert problems(methods=["own_rehearsed:UNDECLARED"], train_limits="5") == []
+    assert problems(methods=["own_rehearsed:STEPPING"], train_limits="auto") == []
 
 
 @pytest.mark.parametrize(
