@@ -150,9 +150,7 @@ def improved(name: str, gap: float, limit: float = 5.0) -> tuple[dict[str, float
         "p3o": PenalisedProximalPolicyOptimisation(P3OConfig(), policy, 1),
         "ipo": InteriorPointPolicyOptimisation(IPOConfig(), policy, 1),
     }
-    constraints = Constraints(
-        np.array([limit]), np.array([gap]), np.zeros(1), math.nan if math.isnan(gap) else 10.0
-    )
+    constraints = Constraints(np.array([limit]), np.array([gap]), np.zeros(1), 10.0)
     experience = Experience.of(policy, BATCH, ADVANTAGES, constraints)
     metrics = improve_and_measure(rules[name], policy, experience, np.random.default_rng(0))
     return metrics, bool(np.any(policy.parameters.to_numpy() != before))
@@ -166,14 +164,6 @@ def test_a_violated_constraint_is_mended_and_no_limit_is_no_penalty(name: str) -
     free, _ = improved(name, -math.inf, math.inf)
     assert free["surrogate_reward"] > 0.0
     assert free["multiplier_0"] == 0.0
-
-
-@pytest.mark.parametrize("name", ["p3o", "ipo"])
-def test_without_a_finished_episode_an_agent_without_multipliers_stays(name: str) -> None:
-    metrics, moved = improved(name, math.nan)
-    assert not moved
-    assert metrics["policy_steps"] == 0.0
-    assert math.isnan(metrics["multiplier_0"])
 
 
 def test_the_slope_of_the_barrier_is_what_ipo_reports_as_its_multiplier() -> None:

@@ -79,7 +79,7 @@ def test_with_a_price_of_the_kl_a_step_is_as_long_as_the_gain_is_large_up_to_the
 ) -> None:
     def stepped(size: float, kl_penalty: float) -> float:
         policy, batch, advantages = sampled(space)
-        experience = Experience.of(policy, batch, advantages, UNKNOWN)
+        experience = Experience.of(policy, batch, advantages, KEPT)
         objective = size * (advantages[:, 0] - advantages[:, 0].mean())
         generator = np.random.default_rng(0)
         config = TRPOConfig(target_kl=DELTA)
@@ -106,7 +106,7 @@ def test_where_no_action_is_better_trpo_stays() -> None:
     assert metrics["policy_steps"] == metrics["step_norm"] == 0.0
 
 
-UNKNOWN = Constraints(np.array([1.0, 1.0]), np.array([math.nan, math.nan]), np.zeros(2), math.nan)
+KEPT = Constraints(np.array([1.0, 1.0]), np.array([-1.0, -1.0]), np.zeros(2), 10.0)
 
 
 def climbed(**options: object) -> tuple[float, bool, set[int]]:
@@ -123,7 +123,7 @@ def climbed(**options: object) -> tuple[float, bool, set[int]]:
     metrics = gradient_ascent(
         policy,
         Adam(policy.parameters, 0.01),
-        Experience.of(policy, batch, advantages, UNKNOWN),
+        Experience.of(policy, batch, advantages, KEPT),
         objective,
         config=PPOConfig.model_validate(options),
         generator=np.random.default_rng(0),
