@@ -44,4 +44,4 @@ def require_model(config: object) -> None:
         TypeError: it is no pydantic model.
     """
     if not (isinstance(config, type) and issubclass(config, BaseModel)):
-        raise TypeError(f"config must be a pydantic model, a subclass of BaseModel, got {config!r}")
+        raise TypeError(f"options need a pydantic model, a subclass of BaseModel, got {config!r}")

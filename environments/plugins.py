@@ -228,8 +228,9 @@ def load_attribute(path: str) -> Any:
             "holds it, name that folder in PYTHONPATH, or install the module's package"
         ) from error
     except (ImportError, AttributeError) as error:
-        module = sys.modules.get(module_name)  # None if the import itself failed
-        hint = nearest(attribute, dir(module)) if module else ""
+        names = dir(sys.modules[module_name]) if module_name in sys.modules else []
+        is_missing = isinstance(error, AttributeError) and attribute not in names
+        hint = nearest(attribute, names) if is_missing else ""
         raise UnknownNameError(f"cannot import {path!r}: {error}{hint}") from error
     except SystemExit as error:
         raise UnknownNameError(

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict
 
 from recrl.environments.cmdp import CostLimits
+from recrl.environments.options import require_model
 from recrl.environments.plugins import WrongKindError, load_attribute, resolve
 from recrl.environments.safety_gym.task_definitions import SAFETY_TASKS
 from recrl.environments.vector import CMDPVectorEnv
@@ -178,8 +179,10 @@ def options_model(name: str) -> type[BaseModel]:
 
     Raises:
         UnknownNameError: the task is not known.
+        TypeError: it is no pydantic model.
     """
     model: type[BaseModel] = _loaded(find_task(name).options)
+    require_model(model)
     return model
 
 

@@ -99,18 +99,23 @@ def sentences(error: ValidationError, model: type[BaseModel] | None) -> Iterator
             yield place, f"{item['msg'][:1].lower()}{item['msg'][1:]}, got {values['given']}"
 
 
-def ignored_keys(model: BaseModel, given: Mapping[str, Any]) -> Iterator[tuple[Place, str]]:
-    """Yield the keys that validation ignored, with a sentence, unless the model says what to do with them.
+def ignored_keys(model: type[BaseModel], given: Mapping[str, Any]) -> Iterator[tuple[Place, str]]:
+    """Yield the keys that validation ignores, with a sentence, unless the model says what to do with them.
+
+    Nested models are left out.
 
     Args:
-        model: what became of the value.
-        given: the value.
+        model: a class, possibly a user's.
+        given: a value that it accepts.
     """
-    if "extra" in model.model_config or len(model.model_fields_set) == len(given):
+    if "extra" in model.model_config:
         return
-    known = list(type(model).model_fields)
-    names = {*known, *(field.alias for field in type(model).model_fields.values())}
-    yield from (((key,), _unknown_key(key, known)) for key in given if key not in names)
+    try:
+        model.model_validate(dict(given), extra="forbid")
+    except ValidationError as error:
+        for item in error.errors(include_url=False):
+            if item["type"] == "extra_forbidden" and len(item["loc"]) == 1:
+                yield item["loc"], _unknown_key(str(item["loc"][0]), list(model.model_fields))
 
 
 def known_keys(model: type[BaseModel] | None, place: Place) -> list[str]:

@@ -270,7 +270,7 @@ def load_episodes(
     else:
         store, specs = sweep, sweep.specs()
 
-    chosen = None if columns is None else [column for column in columns if column not in KEY]
+    chosen = None if columns is None else [it for it in dict.fromkeys(columns) if it not in KEY]
 
     def rows(trial: TrialReader) -> pd.DataFrame:
         try:

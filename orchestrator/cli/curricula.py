@@ -172,9 +172,7 @@ def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
     try:
         options = {**(_beside_preset(method) if "preset" in changed else method.options), **changed}
         require_json(options)
-        config = teacher_config(method.name, options)
-        for place, sentence in ignored_keys(config, options):
-            raise RecrlError(f"--option: {method.name}: {'.'.join(map(str, place))}: {sentence}")
+        teacher_config(method.name, options)
     except ValidationError as error:
         mistakes = list(sentences(error, find_teacher(method.name).config))
         text = "; ".join(f"{'.'.join(map(str, place))}: {sentence}" for place, sentence in mistakes)
@@ -192,6 +190,9 @@ def _teacher(store: SweepStore, request: ReplayRequest) -> Choice:
         raise RecrlError(str(error)) from error
     except USERS_ERRORS as error:
         raise RecrlError(f"teacher {method.name!r} cannot be used: {described(error)}") from error
+    for place, sentence in ignored_keys(find_teacher(method.name).config, options):
+        if place[0] in changed:  # others are as recorded
+            raise RecrlError(f"--option: {method.name}: {place[0]}: {sentence}")
     return Choice(method.name, options, method.label)
 
 

@@ -269,11 +269,8 @@ class _Check:
             require_json(entry.options)  # of an untyped option, model_dump writes an infinite number as null
             options = model.model_dump(mode="json")
             require_json(options)
-            if not _reads_back(entry.name, options, options_of):
-                raise TypeError(
-                    "its model of options must accept what its model_dump returns, and give it again; "
-                    "a field with an alias needs populate_by_name=True"
-                )
+            if reason := _not_read_back(entry.name, model, options_of):
+                raise TypeError(f"its model of options must read back what its model_dump returns ({reason})")
         except ValidationError as error:
             for inner, sentence in sentences(error, _model_of(entry.name, options_of)):
                 self.problems.add((*place, "options", *inner), sentence)
@@ -286,7 +283,7 @@ class _Check:
         except USERS_ERRORS as error:
             self.problems.add(name_place, f"{entry.name!r} cannot be used: {described(error)}")
         else:
-            for inner, sentence in ignored_keys(model, entry.options):
+            for inner, sentence in ignored_keys(type(model), entry.options):
                 self.problems.add((*place, "options", *inner), sentence)
             self._check_network((*place, "options", "network"), options)
             return options
@@ -398,12 +395,17 @@ def _named(value: Any) -> Any:
     )
 
 
-def _reads_back(name: str, options: Mapping[str, Any], options_of: OptionsOf) -> bool:
-    """Whether options with their defaults, as a trial stores them, are read again as they are."""
+def _not_read_back(name: str, model: BaseModel, options_of: OptionsOf) -> str:
+    """Return why options with their defaults, as a trial stores them, are read as others; empty if not."""
+    stored = model.model_dump(mode="json")
     try:
-        return options_of(name, options).model_dump(mode="json") == options
-    except ValidationError:
-        return False
+        again = options_of(name, stored)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    if again.model_dump(mode="json") == stored or again == model:  # sets have no order in a dump
+        return ""
+    return "it reads other values; a field with an alias needs populate_by_name=True"
 
 
 def _model_of(name: str, options_of: OptionsOf) -> type[BaseModel] | None:

@@ -121,7 +121,7 @@ class _SignsOfLife:
         self._writer.heartbeat(update=done.update, env_steps=done.env_steps, steps_per_second=self._speed())
 
     def _speed(self) -> float:
-        """Return the steps per second of whole updates, over ``SPEED_SECONDS`` or since the start."""
+        """Return the steps per second of whole updates, over ``SPEED_SECONDS`` or more if possible."""
         if len(self._ends) < 2:
             return 0.0
         (began, before), (ended, after) = self._ends[0], self._ends[-1]

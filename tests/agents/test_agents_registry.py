@@ -84,7 +84,7 @@ def test_softplus_cannot_begin_at_zero() -> None:
 
 
 def test_an_entry_needs_a_model_of_options() -> None:
-    with pytest.raises(TypeError, match=r"^config must be a pydantic model, .*, got <class 'dict'>$"):
+    with pytest.raises(TypeError, match=r"^options need a pydantic model, .*, got <class 'dict'>$"):
         AgentEntry("Mine.", dict, "mine:make")  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match=r"^config must be a pydantic model"):
+    with pytest.raises(TypeError, match=r"^options need a pydantic model"):
         TeacherKind("Mine.", {}, none_teacher)  # type: ignore[arg-type]

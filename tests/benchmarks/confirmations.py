@@ -105,7 +105,10 @@ def intervals(seeds: pd.DataFrame) -> Iterator[str]:
 
 
 def from_shorter(seeds: pd.DataFrame, shorter: pd.DataFrame) -> Iterator[str]:
-    """Yield how policies after more steps differ from those after fewer steps, with other seeds."""
+    """Yield how policies after more steps differ from those after fewer steps, with other seeds.
+
+    All four groups count as independent.
+    """
     for column in ("return", "cost"):
         groups = [of[column, method].to_numpy() for method in reversed(METHODS) for of in (seeds, shorter)]
         for method, pair in zip(reversed(METHODS), (groups[:2], groups[2:]), strict=True):
@@ -145,7 +148,7 @@ def main() -> None:
                 print("\n".join(intervals(within)))
         if given.shorter:
             rows = pd.read_csv(given.shorter)
-            shorter = pairs(rows[rows["agent"] == AGENT], policy)
+            shorter = pairs(rows[(rows["task"] == rule.task) & (rows["agent"] == AGENT)], policy)
             print(
                 f"{policy}, these seeds minus seeds {', '.join(map(str, shorter.index))} after fewer steps:"
             )

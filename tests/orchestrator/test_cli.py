@@ -1014,6 +1014,26 @@ def test_replay_draws_each_cost_of_the_tasks_that_have_it(
     assert capsys.readouterr().out.count("Figure ") == 2
 
 
+def test_replay_names_an_option_that_a_model_would_ignore(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "my_loose_curriculum.py").write_text(
+        "from pydantic import BaseModel\n"
+        "from recrl.teachers.registry import TeacherKind\n"
+        "from recrl.teachers.static import none_teacher\n"
+        "class Loose(BaseModel):\n    power: float = 1.0\n"
+        "LOOSE = TeacherKind('Loose.', Loose, none_teacher)\n"
+    )
+    monkeypatch.syspath_prepend(folder)
+    assert main(["launch", "grid.yaml", *INLINE, "--only", "method=none"]) == ExitCode.OK
+    replay = ["replay", "small", "--teacher", "my_loose_curriculum:LOOSE", "--trust", "--option"]
+    assert main([*replay, "power=2"]) == ExitCode.OK
+    capsys.readouterr()
+    assert main([*replay, "pwer=2"]) == ExitCode.WRONG_INPUT
+    sentence = "--option: my_loose_curriculum:LOOSE: pwer: unknown key; did you mean 'power'?"
+    assert capsys.readouterr().err == f"recrl-sweep: {sentence}\n"
+
+
 def test_replay_names_recorded_options_that_this_version_does_not_have(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,7 +13,7 @@ from recrl.orchestrator.grid.checking import parse_grid
 OWN = '''\
 import gymnasium
 import numpy as np
-from pydantic import BaseModel, Field, computed_field
+from pydantic import BaseModel, Field, computed_field, model_validator
 
 from recrl.agents.algorithms.ppo import make_ppo
 from recrl.agents.registry import AGENTS, AgentEntry
@@ -104,6 +104,27 @@ class Strict(Loose, extra="forbid"):
 
 class Renamed(BaseModel):
     step_size: float = Field(1.0, alias="stepSize")
+
+
+class Shorthand(BaseModel):
+    """Its keys are not its fields, and it sets a field itself."""
+
+    low: float = 0.0
+    high: float = 1.0
+    width: float = 1.0
+    tags: set[str] = {"speed", "height", "torque", "angle", "energy"}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_range(cls, data):
+        data = dict(data)
+        low, high = data.pop("range", (data.get("low", 0.0), data.get("high", 1.0)))
+        return {**data, "low": low, "high": high}
+
+    @model_validator(mode="after")
+    def _with_width(self):
+        self.width = self.high - self.low
+        return self
 
 
 class Wrapped:
@@ -275,9 +296,9 @@ KINDS = (Staircase, TooLow, NoStep, Long)
 STAIRCASE, TOO_LOW, NO_STEP, LONG = (TeacherKind(kind.__name__, NoOptions, kind) for kind in KINDS)
 TOO_LOW_LATER, RISING, STRAIGHT, AS_TEXT = map(decaying, (too_low_later, rising, straight, as_text))
 UNDECLARED = decaying(straight, measures_start=False)
-LOOSE, STRICT, RENAMED = (
+LOOSE, STRICT, RENAMED, SHORTHAND = (
     TeacherKind(kind.__name__, kind, lambda spec: StaticTeacher(spec, decay=straight), measures_start=True)
-    for kind in (Loose, Strict, Renamed)
+    for kind in (Loose, Strict, Renamed, Shorthand)
 )
 
 
@@ -433,22 +454,40 @@ def test_a_curriculum(curriculum: str, sentence: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "sentences"),
+    ("kind", "options", "sentences"),
     [
-        ({"power": 2, "inner": {"b": 2}}, []),
-        ({"pwer": 2}, ["grid.yaml:4: methods.0.options.pwer: unknown key; did you mean 'power'?"]),
+        ("LOOSE", {"power": 2, "inner": {"b": 2}}, []),
+        ("SHORTHAND", {"range": [1, 2]}, []),
+        (
+            "SHORTHAND",
+            {"wdth": 2},
+            ["grid.yaml:4: methods.0.options.wdth: unknown key; did you mean 'width'?"],
+        ),
+        ("LOOSE", {"pwer": 2}, ["grid.yaml:4: methods.0.options.pwer: unknown key; did you mean 'power'?"]),
     ],
 )
-def test_an_option_that_a_model_would_ignore(options: dict[str, Any], sentences: list[str]) -> None:
+def test_an_option_that_a_model_would_ignore(
+    kind: str, options: dict[str, Any], sentences: list[str]
+) -> None:
     """Nested models and computed fields are the model's own matter."""
-    assert problems(methods=[{"name": "own_rehearsed:LOOSE", "options": options}]) == sentences
+    assert problems(methods=[{"name": f"own_rehearsed:{kind}", "options": options}]) == sentences
 
 
-@pytest.mark.parametrize(("kind", "options"), [("RENAMED", {"stepSize": 2}), ("STRICT", {"power": 2})])
-def test_options_that_cannot_be_read_back(kind: str, options: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("kind", "options", "reason"),
+    [
+        (
+            "RENAMED",
+            {"stepSize": 2},
+            "it reads other values; a field with an alias needs populate_by_name=True",
+        ),
+        ("STRICT", {"power": 2}, "squared: Extra inputs are not permitted"),
+    ],
+)
+def test_options_that_cannot_be_read_back(kind: str, options: dict[str, Any], reason: str) -> None:
     (problem,) = problems(methods=[{"name": f"own_rehearsed:{kind}", "options": options}])
     assert f"methods.0.name: 'own_rehearsed:{kind}' cannot be used: TypeError: its model of " in problem
-    assert problem.endswith("a field with an alias needs populate_by_name=True")
+    assert problem.endswith(f"({reason})")
 
 
 def test_a_decay_that_does_not_declare_its_measurement() -> None:
