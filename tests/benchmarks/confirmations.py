@@ -3,12 +3,16 @@
     python -m tests.benchmarks.confirmations results/safety-gym/button-confirm.csv \
         --earlier results/safety-gym/curricula-today.csv results/safety-gym/table.csv
 
+    python -m tests.benchmarks.confirmations results/safety-gym/long-early.csv \
+        --controls results/safety-gym/long-curricula.csv
+
 The tables are those of ``final_policies.py``; the first one's name says which rule it has. Printed are the
-conditions of the rule, for ppo-lag's final stochastic policies. Then come the differences of linear from
-none in return and cost, with 95% intervals, paired (Student) and as two groups (Welch): of these seeds, of
-these with the first earlier table if there is one, and of all. A table whose seeds suggested the question
-comes last. With ``--shorter``, a table of trials with fewer steps and other seeds, each curriculum is
-compared with itself after fewer steps. That was not planned.
+conditions of the rule, for ppo-lag's final stochastic policies. Then come the differences of a curriculum
+from each control in return and cost, with 95% intervals, paired (Student) and as two groups (Welch): of
+these seeds, of these with the first earlier table if there is one, and of all. A table whose seeds suggested
+the question comes last. With ``--controls``, the trials of the controls are in another table. With
+``--shorter``, a table of trials with fewer steps and other seeds, the curriculum and its control are each
+compared with themselves after fewer steps. That was not planned.
 """
 
 from __future__ import annotations
@@ -18,39 +22,86 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from recrl.analysis.statistics.intervals import Difference, group_difference, paired_difference
+from recrl.environments.cmdp import Floats
 from tests.benchmarks.differences import weighted_sum
 from tests.benchmarks.velocity_table import Cell
 
-AGENT, LIMIT, METHODS = "ppo-lag", 25.0, ["none", "linear"]
+AGENT, LIMIT = "ppo-lag", 25.0
 
 
-def every_pair_earns_more(seeds: pd.DataFrame) -> tuple[bool, str]:
-    """Whether linear earns more than none with each seed."""
-    earned = seeds["return", "linear"] - seeds["return", "none"]
-    each = ", ".join(f"{value:.2f} (seed {seed})" for seed, value in earned.items())
-    said = f"return under linear above none: {each}: {(earned > 0).sum()} of {len(earned)} pairs earn more"
+@dataclass(frozen=True)
+class Pairs:
+    """The final policies of a curriculum and of its control, with the same seeds.
+
+    Attributes:
+        curriculum: its name.
+        control: name of the other curriculum.
+        seeds: a row a seed, with the columns (return, cost or cost_se; name of a curriculum).
+    """
+
+    curriculum: str
+    control: str
+    seeds: pd.DataFrame
+
+    @classmethod
+    def of(cls, rows: pd.DataFrame, policy: str, curriculum: str, control: str) -> Pairs:
+        """Choose the pairs of one kind of policy from rows of final policies."""
+        chosen = rows[(rows["policy"] == policy) & rows["method"].isin([curriculum, control])]
+        columns = ["return", "cost", "cost_se"]
+        return cls(curriculum, control, chosen.pivot(index="seed", columns="method", values=columns).dropna())
+
+    def groups(self, column: str) -> tuple[Floats, Floats]:
+        """Return a column of the curriculum and of the control, each of shape (seeds,)."""
+        table = self.seeds[column]
+        return table[self.curriculum].to_numpy(np.float64), table[self.control].to_numpy(np.float64)
+
+    def kept(self) -> Pairs:
+        """Return the pairs whose control keeps the limit."""
+        cost, error = (self.seeds[column, self.control] for column in ("cost", "cost_se"))
+        return Pairs(self.curriculum, self.control, self.seeds[cost <= LIMIT + error])
+
+    @property
+    def named_seeds(self) -> str:
+        """Name the seeds."""
+        return f"seeds {', '.join(map(str, self.seeds.index))}"
+
+
+def every_pair_earns_more(pairs: Pairs) -> tuple[bool, str]:
+    """Whether the curriculum earns more than its control with each seed."""
+    curriculum, control = pairs.groups("return")
+    earned = curriculum - control
+    each = [f"{value:.2f} (seed {seed})" for seed, value in zip(pairs.seeds.index, earned, strict=True)]
+    count = f"{(earned > 0).sum()} of {len(earned)} pairs earn more"
+    said = f"return under {pairs.curriculum} above {pairs.control}: {', '.join(each)}: {count}"
     return bool((earned > 0).all()), said
 
 
-def groups_earn_less(seeds: pd.DataFrame) -> tuple[bool, str]:
-    """Whether linear earns less than none, by the 95% interval for two independent groups."""
-    it, said = _difference_of_groups(seeds)
+def groups_earn_less(pairs: Pairs) -> tuple[bool, str]:
+    """Whether the curriculum earns less, by the 95% interval for two independent groups."""
+    it, said = _difference_of_groups(pairs)
     return it.high < 0.0, said
 
 
-def groups_earn_less_or_more(seeds: pd.DataFrame) -> tuple[bool, str]:
-    """Whether linear earns less or more than none, by the same interval."""
-    it, said = _difference_of_groups(seeds)
+def groups_earn_more(pairs: Pairs) -> tuple[bool, str]:
+    """Whether the curriculum earns more, by the same interval."""
+    it, said = _difference_of_groups(pairs)
+    return it.low > 0.0, said
+
+
+def groups_earn_less_or_more(pairs: Pairs) -> tuple[bool, str]:
+    """Whether the curriculum earns less or more, by the same interval."""
+    it, said = _difference_of_groups(pairs)
     return it.high < 0.0 or it.low > 0.0, said
 
 
-def _difference_of_groups(seeds: pd.DataFrame) -> tuple[Difference, str]:
-    it = group_difference(*(seeds["return", method].to_numpy() for method in reversed(METHODS)))
-    said = f"return under linear above none, two groups: {it.estimate:.2f} ({it.low:.2f} to {it.high:.2f})"
-    return it, f"{said}, p = {it.p_value:.2g}"
+def _difference_of_groups(pairs: Pairs) -> tuple[Difference, str]:
+    it = group_difference(*pairs.groups("return"))
+    what = f"return under {pairs.curriculum} above {pairs.control}, two groups"
+    return it, f"{what}: {it.estimate:.2f} ({it.low:.2f} to {it.high:.2f}), p = {it.p_value:.2g}"
 
 
 @dataclass(frozen=True)
@@ -59,66 +110,74 @@ class Rule:
 
     Attributes:
         task: on which ppo-lag is judged.
-        seeds: of both curricula.
-        condition: on the returns, and a sentence about it. The other one is on linear's mean cost.
+        seeds: of the curriculum and of its controls.
+        condition: on the returns of the curriculum and of its first control, and a sentence about it. The
+            other condition is on the curriculum's mean cost.
+        curriculum: that is judged.
+        controls: curricula that it is compared with; it is judged against the first.
     """
 
     task: str
     seeds: list[int]
-    condition: Callable[[pd.DataFrame], tuple[bool, str]]
+    condition: Callable[[Pairs], tuple[bool, str]]
+    curriculum: str = "linear"
+    controls: tuple[str, ...] = ("none",)
 
 
+LONG_SEEDS = [126, 127, 128, 129, 130, 131]
 RULES = {
     "button-confirm": Rule("CarButton2", [120, 121, 122], every_pair_earns_more),
     "goal-confirm": Rule("CarGoal2", [120, 121, 122, 123, 124, 125], groups_earn_less),
     "level1": Rule("CarGoal1", [117, 118, 119], groups_earn_less),
-    "long-curricula": Rule("CarGoal2", [126, 127, 128, 129, 130, 131], groups_earn_less_or_more),
+    "long-curricula": Rule("CarGoal2", LONG_SEEDS, groups_earn_less_or_more),
+    "long-early": Rule("CarGoal2", LONG_SEEDS, groups_earn_more, "linear-early", ("linear", "none")),
 }
-
-
-def pairs(rows: pd.DataFrame, policy: str) -> pd.DataFrame:
-    """Return a row a seed, with the columns (return, cost or cost_se; none or linear)."""
-    chosen = rows[rows["policy"] == policy]
-    return chosen.pivot(index="seed", columns="method", values=["return", "cost", "cost_se"]).dropna()
 
 
 def verdict(rows: pd.DataFrame, rule: Rule) -> Iterator[str]:
     """Yield the two conditions of a rule, and whether it is met."""
-    seeds = pairs(rows, "stochastic")
-    if seeds.index.tolist() != rule.seeds:
-        raise SystemExit(f"the planned seeds are {rule.seeds}, complete are {seeds.index.tolist()}")
-    holds, said = rule.condition(seeds)
-    cell = Cell.of("", AGENT, rows[(rows["policy"] == "stochastic") & (rows["method"] == "linear")])
+    pairs = Pairs.of(rows, "stochastic", rule.curriculum, rule.controls[0])
+    if (complete := pairs.seeds.index.tolist()) != rule.seeds:
+        raise SystemExit(f"the planned seeds are {rule.seeds}, complete are {complete}")
+    holds, said = rule.condition(pairs)
+    policies = rows[(rows["policy"] == "stochastic") & (rows["method"] == rule.curriculum)]
+    cell = Cell.of("", AGENT, policies)
     keeps = cell.cost <= LIMIT + cell.cost_error
+    ends = f"{'keeps' if keeps else 'exceeds'} the limit of {LIMIT:g}"
     yield said
-    yield f"mean cost under linear: {cell.costs}: {'keeps' if keeps else 'exceeds'} the limit of {LIMIT:g}"
+    yield f"mean cost under {rule.curriculum}: {cell.costs}: {ends}"
     yield f"the rule is {'met' if keeps and holds else 'not met'}"
 
 
-def intervals(seeds: pd.DataFrame) -> Iterator[str]:
-    """Yield the differences of linear from none, paired and as two groups."""
+def intervals(pairs: Pairs) -> Iterator[str]:
+    """Yield the differences of the curriculum from its control, paired and as two groups."""
     for column in ("return", "cost"):
-        linear, none = seeds[column, "linear"].to_numpy(), seeds[column, "none"].to_numpy()
-        paired, two = paired_difference(linear, none), group_difference(linear, none)
+        groups = pairs.groups(column)
+        paired, two = paired_difference(*groups), group_difference(*groups)
         both = f"paired {paired.low:.2f} to {paired.high:.2f}; Welch {two.low:.2f} to {two.high:.2f}"
         yield f"  {column}: {paired.estimate:.2f} ({both})"
 
 
-def from_shorter(seeds: pd.DataFrame, shorter: pd.DataFrame) -> Iterator[str]:
+def from_shorter(pairs: Pairs, shorter: Pairs) -> Iterator[str]:
     """Yield how policies after more steps differ from those after fewer steps, with other seeds.
 
     All four groups count as independent.
     """
     for column in ("return", "cost"):
-        groups = [of[column, method].to_numpy() for method in reversed(METHODS) for of in (seeds, shorter)]
-        for method, pair in zip(reversed(METHODS), (groups[:2], groups[2:]), strict=True):
-            yield f"  {column} under {method}: {weighted_sum(pair, [1.0, -1.0])}"
-        yield f"  {column}, linear minus none: {weighted_sum(groups, [1.0, -1.0, -1.0, 1.0])}"
+        (curriculum, control), (curriculum_before, control_before) = (
+            it.groups(column) for it in (pairs, shorter)
+        )
+        of_curriculum, of_control = [curriculum, curriculum_before], [control, control_before]
+        yield f"  {column} under {pairs.curriculum}: {weighted_sum(of_curriculum, [1.0, -1.0])}"
+        yield f"  {column} under {pairs.control}: {weighted_sum(of_control, [1.0, -1.0])}"
+        change = weighted_sum([*of_curriculum, *of_control], [1.0, -1.0, -1.0, 1.0])
+        yield f"  {column}, {pairs.curriculum} minus {pairs.control}: {change}"
 
 
-def kept(seeds: pd.DataFrame) -> pd.DataFrame:
-    """Return the pairs whose policy under none keeps the limit."""
-    return seeds[seeds["cost", "none"] <= LIMIT + seeds["cost_se", "none"]]
+def of_task(table: Path, task: str) -> pd.DataFrame:
+    """Read the rows of AGENT on one task."""
+    rows = pd.read_csv(table)
+    return rows[(rows["task"] == task) & (rows["agent"] == AGENT)]
 
 
 def main() -> None:
@@ -127,32 +186,33 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("fresh", type=Path)
+    parser.add_argument("--controls", type=Path)
     parser.add_argument("--earlier", type=Path, nargs="+", default=[])
     parser.add_argument("--shorter", type=Path)
     given = parser.parse_args()
-    fresh = pd.read_csv(given.fresh)
     if (rule := RULES.get(given.fresh.stem)) is None:
         parser.error(f"{given.fresh}: has no rule; those with one are {', '.join(RULES)}")
-    everything = pd.concat([fresh, *map(pd.read_csv, given.earlier)], keys=range(1 + len(given.earlier)))
-    of_question = everything[(everything["task"] == rule.task) & (everything["agent"] == AGENT)]
-    of_question = of_question[of_question["method"].isin(METHODS)]
-    print("\n".join(verdict(of_question.loc[[0]], rule)))
+    of_rule = [given.fresh, given.controls] if given.controls else [given.fresh]
+    fresh = pd.concat(of_task(it, rule.task) for it in of_rule)
+    tables = [fresh, *(of_task(it, rule.task) for it in given.earlier)]
+    print("\n".join(verdict(fresh, rule)))
     for policy in ("stochastic", "deterministic"):
-        for last in range(1 + len(given.earlier)):
-            seeds = pairs(of_question.loc[:last], policy)
-            print(f"{policy}, linear minus none, seeds {', '.join(map(str, seeds.index))}:")
-            print("\n".join(intervals(seeds)))
-            within = kept(seeds)
-            if 1 < len(within) < len(seeds):
-                print(f" of these, where none keeps the limit, seeds {', '.join(map(str, within.index))}:")
-                print("\n".join(intervals(within)))
-        if given.shorter:
-            rows = pd.read_csv(given.shorter)
-            shorter = pairs(rows[(rows["task"] == rule.task) & (rows["agent"] == AGENT)], policy)
-            print(
-                f"{policy}, these seeds minus seeds {', '.join(map(str, shorter.index))} after fewer steps:"
-            )
-            print("\n".join(from_shorter(pairs(of_question.loc[[0]], policy), shorter)))
+        for control in rule.controls:
+            for count in range(1, 1 + len(tables)):
+                pairs = Pairs.of(pd.concat(tables[:count]), policy, rule.curriculum, control)
+                print(f"{policy}, {rule.curriculum} minus {control}, {pairs.named_seeds}:")
+                print("\n".join(intervals(pairs)))
+                within = pairs.kept()
+                if 1 < len(within.seeds) < len(pairs.seeds):
+                    print(f" of these, where {control} keeps the limit, {within.named_seeds}:")
+                    print("\n".join(intervals(within)))
+            if given.shorter:
+                pairs, shorter = (
+                    Pairs.of(rows, policy, rule.curriculum, control)
+                    for rows in (fresh, of_task(given.shorter, rule.task))
+                )
+                print(f"{policy}, these seeds minus {shorter.named_seeds} after fewer steps:")
+                print("\n".join(from_shorter(pairs, shorter)))
 
 
 if __name__ == "__main__":
