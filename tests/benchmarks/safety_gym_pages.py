@@ -114,16 +114,33 @@ def of_policy(rows: pd.DataFrame, policy: str) -> pd.DataFrame:
 
 
 def policies(rows: pd.DataFrame) -> Iterator[str]:
-    """Yield the table of final policies: stochastic ones a column a seed, then the means of either kind."""
+    """Yield a table of final policies: stochastic ones with each seed, then the means of either kind.
+
+    A row is an agent, a task and a curriculum. If there is one agent and one task only, these are columns.
+    """
     seeds = sorted(rows["seed"].unique())
-    yield from header(*FIRST_COLUMNS, *(f"seed {it}" for it in seeds), "mean", "deterministic, mean")
-    for key, group in groups(rows):
-        stochastic, deterministic = (of_policy(group, it) for it in POLICIES)
-        of_seed = (
-            stochastic.set_index("seed")[["return", "cost"]].map("{:.1f}".format).agg(" / ".join, axis=1)
-        )
-        each = [str(text) for text in of_seed.reindex(seeds, fill_value="")]
-        yield line(*first_cells(key), *each, interval_of(stochastic), interval_of(deterministic))
+    ends = ["mean", "deterministic, mean"]
+    table = {key: [*of_seeds(group, seeds), *means_of(group)] for key, group in groups(rows)}
+    if len(rows[["agent", "task"]].drop_duplicates()) == 1:
+        yield from header("seed", *(f"`{method}`" for _, _, method in table))
+        for row in zip([*map(str, seeds), *ends], *table.values(), strict=True):
+            yield line(*row)
+        return
+    yield from header(*FIRST_COLUMNS, *(f"seed {it}" for it in seeds), *ends)
+    for key, cells in table.items():
+        yield line(*first_cells(key), *cells)
+
+
+def of_seeds(rows: pd.DataFrame, seeds: list[int]) -> list[str]:
+    """Return the return / cost of the stochastic policy of each seed; empty where there is none."""
+    measured = of_policy(rows, "stochastic").set_index("seed")[["return", "cost"]]
+    texts = measured.map("{:.1f}".format).agg(" / ".join, axis=1)
+    return [str(text) for text in texts.reindex(seeds, fill_value="")]
+
+
+def means_of(rows: pd.DataFrame) -> list[str]:
+    """Return the mean return, with its interval, and the mean cost of either kind of policy."""
+    return [interval_of(of_policy(rows, it)) for it in POLICIES]
 
 
 def shown(row: pd.Series[Any]) -> str:
