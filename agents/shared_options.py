@@ -81,7 +81,7 @@ class ActorCriticConfig(Options):
     preset: Literal["recommended", "paper"] = Field(
         default="recommended",
         description="Source of unset options: recommended (ours), or paper "
-        "(safety-starter-agents, as used in the paper).",
+        "(safety-starter-agents, as used in the paper; give run: {num_envs: 30, rollout_steps: 1000}, too).",
     )
     hidden_sizes: Annotated[tuple[Width, ...], Field(max_length=8)] = Field(
         default=(64, 64),

@@ -118,10 +118,14 @@ class TrialSpec:
         return -(-self.total_steps // self.steps_per_update)
 
     @property
-    def lacks_deployment(self) -> bool:
-        """Whether no update falls into the deployment phase that was asked for."""
-        last_begins = (self.num_updates - 1) * self.steps_per_update
-        return self.deploy_steps > 0 and last_begins < self.train_steps
+    def train_updates(self) -> int:
+        """Policy updates of the training phase; the last one may end after it."""
+        return -(-self.train_steps // self.steps_per_update)
+
+    @property
+    def deploy_updates(self) -> int:
+        """Policy updates of the deployment phase."""
+        return self.num_updates - self.train_updates
 
     @property
     def teacher(self) -> TeacherSpec:

@@ -44,7 +44,7 @@ def hard_landing_sentence(titles: Sequence[str]) -> str:
 def short_deployment_sentence(specs: Sequence[TrialSpec]) -> str:
     """Return the warning about curricula whose deployment phase is shorter than an update; empty for none."""
     what = "the deployment phase is shorter than an update, so that no update learns under d_d"
-    short = [spec for spec in specs if spec.lacks_deployment and _is_relaxed(spec)]
+    short = [spec for spec in specs if spec.deploy_steps and not spec.deploy_updates and _is_relaxed(spec)]
     if not short:
         return ""
     rounding = 0.5  # of deploy_steps
@@ -85,14 +85,9 @@ def short_training_sentence(specs: Sequence[TrialSpec], horizons: Mapping[str, i
     tasks = dict.fromkeys(
         spec.task.label
         for spec in specs
-        if _training_updates(spec) * spec.rollout_steps < (horizons[spec.task.label] or 0)
+        if spec.train_updates * spec.rollout_steps < (horizons[spec.task.label] or 0)
     )
     return _warning(what, list(tasks), "take more total_steps or fewer num_envs")
-
-
-def _training_updates(spec: TrialSpec) -> int:
-    """Return the policy updates of the training phase; the last one may end after it."""
-    return -(-spec.train_steps // spec.steps_per_update)
 
 
 def unknown_horizon_sentence(tasks: Sequence[str]) -> str:

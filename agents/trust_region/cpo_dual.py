@@ -7,8 +7,9 @@ step by a trust region:
 
 with g minus the gradient of the reward surrogate, b_i the gradient of cost surrogate i, H the Hessian of the
 mean KL and c_i how far constraint i is violated. **c_i is in the unit of b_i**: if surrogates are in cost per
-step, c_i = (mean episode cost i - limit i) / mean episode length. Two well-known libraries wrongly combine
-episode units with b.
+step, c_i = (mean episode cost i - limit i) / mean episode length. safety-starter-agents divides by it, too;
+omnisafe/algorithms/on_policy/second_order/cpo.py (commit 15603dd) and safepo/single_agent/cpo.py of
+Safe-Policy-Optimization (commit 8d0fa76) take c_i per episode and b_i per step.
 
 The optimum is x = -(v + sum_i nu_i w_i) / lam with v = H^-1 g, w_i = H^-1 b_i, so only the products
 q = g.v, r_i = g.w_i, S_ij = b_i.w_j matter. The paper and safety-starter-agents solve k = 1 by distinguishing

@@ -20,6 +20,9 @@ from recrl.analysis.statistics.intervals import (
 )
 from recrl.analysis.statistics.verdicts import is_cost, tie
 
+# Columns of outcomes that a comparison reads, beside cost_i.
+NEEDED = (*KEY, "measure", "episode_return", "feasible", "optimal_return")
+
 Compare = Callable[..., Difference]  # paired_difference or group_difference
 
 
@@ -32,7 +35,7 @@ def comparisons(
     values are corrected for the rows that are given: choose tasks, agents and methods before the call.
 
     Args:
-        rows: of ``outcomes``.
+        rows: of ``outcomes``, or others with NEEDED, and cost_i where costs are compared.
         generator: draws the resamples.
         baseline: name (label) of the method that the others are compared with.
 
@@ -51,10 +54,10 @@ def comparisons(
         * too_few_seeds: the bootstrap interval is too short.
 
     Raises:
-        ValueError: no row has the given baseline, or a trial is in the rows twice. Without ``none`` the table
-            is empty by default.
+        ValueError: a column is missing, no row has the given baseline, or a trial is in the rows twice.
+            Without ``none`` the table is empty by default.
     """
-    _check_unique(rows)
+    _check_rows(rows)
     if baseline != BASELINE:
         _check_label(rows, "method", baseline)
     lines = []
@@ -78,7 +81,7 @@ def group_comparisons(
     both sides are feasible.
 
     Args:
-        rows: of ``outcomes``.
+        rows: as for ``comparisons``.
         generator: draws the resamples.
         of: what is compared: methods with the same agent, or agents under the same method.
         baseline: name (label) of the method, or agent, that the others are compared with.
@@ -90,11 +93,12 @@ def group_comparisons(
         baseline_seeds and baseline_feasible_seeds.
 
     Raises:
-        ValueError: ``of`` is something else, no row has the given baseline, or a trial is in the rows twice.
+        ValueError: ``of`` is something else, a column is missing, no row has the given baseline, or a trial
+            is in the rows twice.
     """
     if of not in ("method", "agent"):
         raise ValueError(f"of: must be 'method' or 'agent', got {of!r}")
-    _check_unique(rows)
+    _check_rows(rows)
     _check_label(rows, of, baseline)
     lines = []
     for line, ours, theirs in _beside(rows, of, baseline):
@@ -105,7 +109,10 @@ def group_comparisons(
     return _compared(lines, rows, [*counts, *(f"baseline_{name}" for name in counts)])
 
 
-def _check_unique(rows: pd.DataFrame) -> None:
+def _check_rows(rows: pd.DataFrame) -> None:
+    if missing := [name for name in NEEDED if name not in rows]:
+        unknown = "where J*(d_d) is unknown optimal_return is NaN"
+        raise ValueError(f"rows: no column {', '.join(missing)}; {unknown}")
     twice = rows[rows.duplicated([*KEY, "measure"])]
     if len(twice):
         names = ", ".join(str(twice.iloc[0][name]) for name in (*KEY, "measure"))

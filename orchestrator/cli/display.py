@@ -19,7 +19,7 @@ from recrl.orchestrator.background_thread import background_thread
 from recrl.orchestrator.counting import counted
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.launch_plan import Estimate, Plan, PlannedAction
-from recrl.orchestrator.spec import TrialStatus
+from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, TrialProgress
 
 TERMINAL_SECONDS = 1.0
@@ -72,6 +72,12 @@ def plan_sentence(plan: Plan) -> str:
     }
     parts = [f"{number} {words[action]}" for action, number in plan.counts.items() if number]
     return f"{counted(len(plan.trials), 'trial')}: {', '.join(parts)}"
+
+
+def updates_sentence(spec: TrialSpec) -> str:
+    """Say how many updates a trial of a grid has, and how many of them in the deployment phase."""
+    updates = counted(spec.num_updates, "policy update")
+    return f"a trial has {updates}, {spec.deploy_updates} of them in the deployment phase under d_d"
 
 
 def estimate_sentence(estimate: Estimate, where: str) -> str:

@@ -12,6 +12,7 @@
 
     sweep = recrl.launch("demo.yaml")         # or recrl-sweep launch demo.yaml
     sweep = recrl.load_sweep("runs/demo")
+    rows = recrl.outcomes(sweep)              # a row a trial and measure
 
 Each name is imported when it is first used.
 """
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     from recrl._results import Policy, load_policy, load_sweep
     from recrl._tasks import make, make_env
     from recrl._train_and_launch import Training, launch, train, validate
+    from recrl.analysis.data.sweep_data import load_episodes
+    from recrl.analysis.statistics.comparisons import comparisons, group_comparisons
+    from recrl.analysis.statistics.metrics import outcomes
     from recrl.orchestrator.errors import GridError, RecrlError
 
     __version__: str
@@ -35,11 +39,15 @@ __all__ = [
     "RecrlError",
     "Training",
     "__version__",
+    "comparisons",
+    "group_comparisons",
     "launch",
+    "load_episodes",
     "load_policy",
     "load_sweep",
     "make",
     "make_env",
+    "outcomes",
     "train",
     "validate",
 ]
@@ -49,11 +57,15 @@ _PLACES = {
     "Policy": "recrl._results",
     "RecrlError": "recrl.orchestrator.errors",
     "Training": "recrl._train_and_launch",
+    "comparisons": "recrl.analysis.statistics.comparisons",
+    "group_comparisons": "recrl.analysis.statistics.comparisons",
     "launch": "recrl._train_and_launch",
+    "load_episodes": "recrl.analysis.data.sweep_data",
     "load_policy": "recrl._results",
     "load_sweep": "recrl._results",
     "make": "recrl._tasks",
     "make_env": "recrl._tasks",
+    "outcomes": "recrl.analysis.statistics.metrics",
     "train": "recrl._train_and_launch",
     "validate": "recrl._train_and_launch",
 }

@@ -188,3 +188,23 @@ def test_one_seed_has_no_p_value_and_ties_have_one_of_1(finished: Sweep) -> None
     equal.loc[equal["method"] == "linear", "episode_return"] += 1e-6
     tied = comparisons(equal, np.random.default_rng(0))
     assert set(tied["return_difference_p"]) == {1.0}
+
+
+def test_rows_of_another_library_are_compared() -> None:
+    ours, theirs = [5.0, 7.0, 6.5], [4.0, 4.5, 6.0]
+    rows = pd.DataFrame(
+        {
+            "agent": ["ours"] * 3 + ["theirs"] * 3,
+            "seed": [0, 1, 2] * 2,
+            "episode_return": [*ours, *theirs],
+            "cost_0": [24.0, 26.0, 25.0, 31.0, 28.0, 30.0],
+        }
+    ).assign(task="CarGoal2", method="none", measure="stochastic", feasible=True, optimal_return=math.nan)
+    line = group_comparisons(rows, np.random.default_rng(0), of="agent", baseline="theirs").iloc[0]
+    welch = stats.ttest_ind(ours, theirs, equal_var=False)
+    assert line["return_difference"] == pytest.approx((18.5 - 14.5) / 3)
+    assert line["return_difference_p"] == pytest.approx(welch.pvalue)
+    assert line["cost_0_difference"] == pytest.approx((75.0 - 89.0) / 3)
+    said = r"^rows: no column feasible, optimal_return; where J\*\(d_d\) is unknown optimal_return is NaN$"
+    with pytest.raises(ValueError, match=said):
+        comparisons(rows.drop(columns=["feasible", "optimal_return"]), np.random.default_rng(0))

@@ -153,6 +153,7 @@ def test_a_right_grid_is_confirmed(folder: Path, capsys: pytest.CaptureFixture[s
     assert main(["validate", "grid.yaml"]) == ExitCode.OK
     assert capsys.readouterr().out == (
         "grid.yaml: small is right: 2 trials, from tasks x agents x methods x seeds = 1 x 1 x 2 x 1\n"
+        "a trial has 4 policy updates, 2 of them in the deployment phase under d_d\n"
     )
 
 
