@@ -74,10 +74,15 @@ def plan_sentence(plan: Plan) -> str:
     return f"{counted(len(plan.trials), 'trial')}: {', '.join(parts)}"
 
 
-def updates_sentence(spec: TrialSpec) -> str:
-    """Say how many updates a trial of a grid has, and how many of them in the deployment phase."""
-    updates = counted(spec.num_updates, "policy update")
-    return f"a trial has {updates}, {spec.deploy_updates} of them in the deployment phase under d_d"
+def update_counts(specs: Iterable[TrialSpec]) -> Iterator[str]:
+    """Say how many updates trials have, and how many under d_d: a sentence for tasks with equal numbers."""
+    tasks: dict[tuple[int, int], dict[str, None]] = {}
+    for spec in specs:
+        tasks.setdefault((spec.num_updates, spec.deploy_updates), {})[spec.task.label] = None
+    for (updates, deployed), names in tasks.items():
+        of_tasks = f"{', '.join(names)}: " if len(tasks) > 1 else ""
+        number = counted(updates, "policy update")
+        yield f"{of_tasks}a trial has {number}, {deployed} of them in the deployment phase under d_d"
 
 
 def estimate_sentence(estimate: Estimate, where: str) -> str:

@@ -37,7 +37,8 @@ def run_validate(request: ValidateRequest, console: Console) -> ExitCode:
         f"{request.grid}: {grid.name} is right: {counted(len(grid.trials()), 'trial')}, from "
         f"tasks x agents x methods x seeds = {product}",
     )
-    say(console, display.updates_sentence(grid.trials()[0]))
+    for line in display.update_counts(grid.trials()):
+        say(console, line)
     _print_warnings(grid, grid.trials(), console)
     return ExitCode.OK
 
@@ -103,8 +104,8 @@ def say_plan(
 ) -> None:
     """Print what a launch would do, and its estimated time and memory."""
     say(console, f"{grid.name}: {display.plan_sentence(plan)}")
-    if plan.to_do:
-        say(console, display.updates_sentence(plan.to_do[0]))
+    for line in display.update_counts(plan.to_do):
+        say(console, line)
     say(console, display.estimate_sentence(estimate(plan, concurrent=at_once, speeds=speeds), where))
     _print_warnings(grid, plan.to_do, console)
 

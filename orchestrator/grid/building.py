@@ -226,7 +226,7 @@ def _check_decay(spec: TrialSpec, cmdp: CMDPSpec) -> None:
         return
     check = AnswerCheck(spec.method.label, cmdp.cost_names, train_limits, spec.deploy_limits)
     step, state = teacher.start()
-    updates = -(-spec.train_steps // spec.steps_per_update)
+    updates = spec.train_updates
     chosen = np.linspace(1, updates, min(updates, CHECKED_UPDATES), dtype=int).tolist()
     for number, update in enumerate(chosen, 1):  # reports have consecutive numbers
         answer = teacher.step(state, ProgressReport(number, update * spec.steps_per_update, ()))

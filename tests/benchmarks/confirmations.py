@@ -12,7 +12,8 @@ from each control in return and cost, with 95% intervals, paired (Student) and a
 these seeds, of these with the first earlier table if there is one, and of all. A table whose seeds suggested
 the question comes last. With ``--controls``, the trials of the controls are in another table. With
 ``--shorter``, a table of trials with fewer steps and other seeds, the curriculum and its control are each
-compared with themselves after fewer steps. That was not planned.
+compared with themselves after fewer steps. That was not planned. A rule is judged when all planned seeds
+have run.
 """
 
 from __future__ import annotations
@@ -51,6 +52,10 @@ class Pairs:
     def of(cls, rows: pd.DataFrame, policy: str, curriculum: str, control: str) -> Pairs:
         """Choose the pairs of one kind of policy from rows of final policies."""
         chosen = rows[(rows["policy"] == policy) & rows["method"].isin([curriculum, control])]
+        if missing := sorted({curriculum, control} - set(chosen["method"])):
+            raise SystemExit(
+                f"no table has policies under {missing[0]}; --controls names a table of controls"
+            )
         columns = ["return", "cost", "cost_se"]
         return cls(curriculum, control, chosen.pivot(index="seed", columns="method", values=columns).dropna())
 
@@ -141,12 +146,22 @@ def verdict(rows: pd.DataFrame, rule: Rule) -> Iterator[str]:
         raise SystemExit(f"the planned seeds are {rule.seeds}, complete are {complete}")
     holds, said = rule.condition(pairs)
     policies = rows[(rows["policy"] == "stochastic") & (rows["method"] == rule.curriculum)]
+    policies = policies[policies["seed"].isin(rule.seeds)]
     cell = Cell.of("", AGENT, policies)
     keeps = cell.cost <= LIMIT + cell.cost_error
     ends = f"{'keeps' if keeps else 'exceeds'} the limit of {LIMIT:g}"
     yield said
     yield f"mean cost under {rule.curriculum}: {cell.costs}: {ends}"
     yield f"the rule is {'met' if keeps and holds else 'not met'}"
+
+
+def exceeding(rows: pd.DataFrame, policy: str) -> Iterator[str]:
+    """Yield how many policies of each curriculum exceed the limit by more than one standard error."""
+    chosen = rows[rows["policy"] == policy]
+    for method, costs in chosen.groupby("method", sort=False):
+        seeds = costs.loc[costs["cost"] > LIMIT + costs["cost_se"], "seed"]
+        which = f": seeds {', '.join(map(str, seeds))}" if len(seeds) else ""
+        yield f"{policy}, {method}: {len(seeds)} of {len(costs)} exceed the limit{which}"
 
 
 def intervals(pairs: Pairs) -> Iterator[str]:
@@ -197,6 +212,7 @@ def main() -> None:
     tables = [fresh, *(of_task(it, rule.task) for it in given.earlier)]
     print("\n".join(verdict(fresh, rule)))
     for policy in ("stochastic", "deterministic"):
+        print("\n".join(exceeding(fresh[fresh["method"].isin([rule.curriculum, *rule.controls])], policy)))
         for control in rule.controls:
             for count in range(1, 1 + len(tables)):
                 pairs = Pairs.of(pd.concat(tables[:count]), policy, rule.curriculum, control)

@@ -157,6 +157,23 @@ def test_a_right_grid_is_confirmed(folder: Path, capsys: pytest.CaptureFixture[s
     )
 
 
+def test_tasks_with_unequal_rollouts_have_unequal_numbers_of_updates(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "grid.yaml").write_text(
+        "name: two\ntasks: [two-state, rivergrid-1a, rivergrid-1b]\ndeploy_limits: 1\nagents: [ppo]\n"
+        "methods: [none]\nseeds: 1\nrun: {total_steps: 100_000}\n"
+    )
+    for command in ("validate", "plan"):
+        assert main([command, "grid.yaml"]) == ExitCode.OK
+        # 100,000 steps, the last 5,000 under d_d, in updates of 640 and 4,096
+        assert (
+            "two-state: a trial has 157 policy updates, 8 of them in the deployment phase under d_d\n"
+            "rivergrid-1a, rivergrid-1b: a trial has 25 policy updates, 1 of them in the deployment phase "
+            "under d_d\n"
+        ) in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("command", [["validate"], ["plan"], ["launch", *INLINE]])
 def test_a_wrong_grid_starts_nothing(
     folder: Path, capsys: pytest.CaptureFixture[str], command: list[str]

@@ -24,6 +24,7 @@ MANUAL = {"Install", "Quickstart", "The same in Python", "What there is", "Docum
 DEFINITIONS = {
     "": {"2024": "a year"},
     "What was found": {
+        "1.5e6": "steps of a trial with the published settings",
         "2e6": "steps of a trial",
         "1e7": "steps of a published run",
     },
