@@ -27,9 +27,11 @@ from recrl.orchestrator.launch_grid import LaunchListener, LaunchOptions, Launch
 from recrl.orchestrator.launch_plan import Plan
 from recrl.orchestrator.redaction import redacted
 from recrl.orchestrator.run_sweep import SweepResult
+from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.sweep_place import SweepPlace
-from recrl.orchestrator.sweep_progress import DisplayStatus, progress
-from recrl.orchestrator.tracking.mlflow_sync import last_report, without_export
+from recrl.orchestrator.sweep_progress import DisplayStatus, SweepProgress, progress
+from recrl.orchestrator.tracking.client import tracking_uri
+from recrl.orchestrator.tracking.mlflow_sync import last_report, report_mark, without_export
 
 if TYPE_CHECKING:
     from recrl.analysis.data.sweep_data import Sweep
@@ -86,6 +88,7 @@ class _Printer(LaunchListener):
         self._options = options
         self._console = console
         self._store = SweepStore(options.root, grid.name)
+        self._mlflow = MlflowWarning(self._store, options) if options.mlflow else None
         self._has_run = False  # whether all trials have ended
 
     @contextmanager
@@ -104,9 +107,15 @@ class _Printer(LaunchListener):
             doing = f"Connecting to the Ray cluster at {address}" if address else "Starting Ray"
             say(self._console, f"{doing} ...")
         chosen = [trial.spec for trial in plan.trials]
-        with display.live_progress(lambda: progress(chosen, self._store), self._console):
+        with display.live_progress(lambda: self._progress(chosen), self._console):
             yield
         self._has_run = True
+
+    def _progress(self, specs: Sequence[TrialSpec]) -> SweepProgress:
+        """Read the progress; print once why MLflow is behind, if it is."""
+        if sentence := self._mlflow and self._mlflow.once():
+            say(self._console, f"warning: {sentence}")
+        return progress(specs, self._store)
 
     def stopping(self) -> None:
         """Print that trials save their state, or that they have ended."""
@@ -140,6 +149,26 @@ class _Printer(LaunchListener):
     def failed_to_film(self, error: RecrlError) -> None:
         """Print the error."""
         say(self._console, f"           no video: {error}")
+
+
+class MlflowWarning:
+    """What keeps MLflow behind during a launch, said once: a wrong password, for example."""
+
+    def __init__(self, store: SweepStore, options: LaunchOptions) -> None:
+        self._store = store
+        self._uri = tracking_uri(store, options.tracking_uri)
+        self._before = report_mark(store, self._uri)  # of an earlier launch
+        self._is_said = False
+
+    def once(self) -> str:
+        """Return the sentence after the first pass of this launch that was broken off, else an empty text."""
+        if self._is_said or report_mark(self._store, self._uri) == self._before:
+            return ""
+        report = last_report(self._store, self._uri)
+        if report is None or not report.is_broken_off:
+            return ""
+        self._is_said = True
+        return f"MLflow is behind ({report.problem}); training goes on, and it is tried again"
 
 
 def _say_results(sweep: Sweep, console: Console) -> None:

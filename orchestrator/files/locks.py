@@ -19,7 +19,7 @@ from typing import IO
 from recrl.orchestrator.errors import StorageError
 
 FLAGS = os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
-
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # of a file system
 
 _open: set[int] = set()  # descriptors of this process's locks
 
@@ -36,8 +36,8 @@ def opened_lock(path: Path) -> Iterator[IO[str]]:
         try:
             yield file
         finally:
-            fcntl.flock(file, fcntl.LOCK_UN)
             _open.discard(file.fileno())
+            flock(file, fcntl.LOCK_UN)
 
 
 @contextmanager
@@ -45,11 +45,29 @@ def locked(path: Path) -> Iterator[None]:
     """Hold a lock alone; waits for it.
 
     Raises:
-        StorageError: it is a link, a folder or another special file.
+        StorageError: it is a link, a folder or another special file, or the file system has no locks.
     """
     with opened_lock(path) as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        flock(file, fcntl.LOCK_EX)
         yield
+
+
+def flock(file: IO[str], how: int) -> None:
+    """Take or release a lock by ``fcntl.flock``.
+
+    Raises:
+        BlockingIOError: another process holds it, and ``how`` does not wait.
+        StorageError: the file system has no locks.
+    """
+    try:
+        fcntl.flock(file, how)
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        raise StorageError(
+            "the file system of the results has no locks (Lustre and NFS can be mounted with them); "
+            "keep the sweep elsewhere, by --root or --storage"
+        ) from error
 
 
 def _let_go() -> None:

@@ -71,7 +71,7 @@ from recrl.orchestrator.files.atomic_files import (
     write_atomically,
     write_sealed,
 )
-from recrl.orchestrator.files.locks import look_at_lock, opened_lock
+from recrl.orchestrator.files.locks import flock, look_at_lock, opened_lock
 from recrl.orchestrator.files.move_aside import move_aside
 from recrl.orchestrator.files.row_files import Extent
 from recrl.orchestrator.files.trial_files import PathIn
@@ -287,7 +287,7 @@ class SweepStore:
         """Whether a process runs the sweep."""
         try:
             with look_at_lock(self.lock_path) as file:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+                flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
             return True
         except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
@@ -329,14 +329,14 @@ def _try_lock(file: IO[str]) -> bool:
     end = time.monotonic() + PROBE_SECONDS
     while True:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             return True
         except BlockingIOError:
             try:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+                flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
                 return False
-            fcntl.flock(file, fcntl.LOCK_UN)
+            flock(file, fcntl.LOCK_UN)
             if time.monotonic() > end:
                 return False
             time.sleep(

@@ -36,6 +36,7 @@ CONNECT_SECONDS = 5.0
 CONNECT_TRIES = 3
 OBJECT_STORE_BYTES = 80 * 2**20  # Ray requires 75 MiB at least; recrl stores nothing of that size
 ADDRESS_VARIABLE = "RAY_ADDRESS"
+MISMATCH = "Version mismatch"  # in Ray's error, if this process has another Ray or Python than the cluster
 MODE_VARIABLE = "RAY_AUTH_MODE"
 TOKEN_VARIABLE = "RAY_AUTH_TOKEN_PATH"
 TOKEN = "token"  # in the cluster's folder
@@ -178,7 +179,9 @@ def _connection(failure: str, hint: str, **settings: Any) -> Iterator[None]:
         except SystemExit as error:  # Ray's reaction to a SIGTERM during its start; nothing runs yet
             raise KeyboardInterrupt from error
         except Exception as error:
-            raise ClusterError(f"{failure}: {first_line(error)}{hint}") from error
+            said = first_line(error)
+            same = "; install that Ray and Python here, or start a cluster from docker/ (docker/README.md)"
+            raise ClusterError(f"{failure}: {said}{same if MISMATCH in said else hint}") from error
         yield
     finally:
         ray.shutdown()

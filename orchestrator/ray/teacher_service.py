@@ -10,9 +10,10 @@ from typing import Any
 
 import ray
 from ray.exceptions import GetTimeoutError, RayActorError, RayTaskError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from recrl.environments.cmdp import CurriculumStep
-from recrl.orchestrator.errors import TeacherUnavailableError
+from recrl.orchestrator.errors import TeacherUnavailableError, first_line
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec, TeacherState
 
@@ -37,7 +38,10 @@ class TeacherService:
 
 
 def start_teacher_service(name: str) -> Any:
-    """Start the service; the driver calls this, so that no trial's placement group owns it.
+    """Start the service on this node; the driver calls this, so that no trial's placement group owns it.
+
+    Ray would put an actor that takes no core on any node. A node without cores may lack recrl, because
+    ``check_nodes`` leaves it out.
 
     Args:
         name: for ``find_teacher_service``, anywhere in the cluster.
@@ -46,8 +50,9 @@ def start_teacher_service(name: str) -> Any:
         The actor's handle. The service lives as long as the driver holds it, and is restarted whenever it
         dies. It takes no core.
     """
+    here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
     options = {"name": name, "namespace": NAMESPACE, "num_cpus": 0, "max_restarts": -1}
-    return ray.remote(TeacherService).options(**options).remote()
+    return ray.remote(TeacherService).options(**options, scheduling_strategy=here).remote()
 
 
 def find_teacher_service(name: str) -> Any:
@@ -100,7 +105,8 @@ class RayTeacher:
                 if time.monotonic() + pause > deadline:
                     raise TeacherUnavailableError(
                         f"the teacher service has not answered for {self._patience_seconds:g} seconds "
-                        f"({type(error).__name__}); the trial can be resumed by launching the sweep again"
+                        f"({type(error).__name__}: {first_line(error)}); "
+                        "the trial can be resumed by launching the sweep again"
                     ) from error
             time.sleep(pause)
             pause = min(2.0 * pause, LONGEST_PAUSE_SECONDS)

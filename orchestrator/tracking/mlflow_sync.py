@@ -23,6 +23,7 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 from recrl.orchestrator.errors import DamagedError, StorageError, first_line
 from recrl.orchestrator.files.atomic_files import write_json
@@ -35,7 +36,7 @@ from recrl.orchestrator.tracking.client import is_away, one_line
 from recrl.orchestrator.tracking.export_file import ExportWriter
 from recrl.orchestrator.tracking.final_outcomes import FinalOutcomes
 from recrl.orchestrator.tracking.mlflow_runs import SweepRuns
-from recrl.orchestrator.tracking.positions import exclusive, sync_folder
+from recrl.orchestrator.tracking.positions import exclusive, file_mark, sync_folder
 from recrl.orchestrator.tracking.sweep_sync import SweepSync
 from recrl.orchestrator.tracking.trial_sync import TrialSync
 
@@ -90,10 +91,22 @@ def sync(
 def last_report(store: SweepStore, uri: str) -> SyncReport | None:
     """Return the report of the last finished pass of any process; None if there was none."""
     try:
-        saved = json.loads((sync_folder(store, uri) / "report.json").read_text())
+        saved = json.loads(_report_path(store, uri).read_text())
         return SyncReport(**{key: saved[key] for key in SyncReport.__dataclass_fields__ if key in saved})
     except (OSError, ValueError, TypeError):
         return None
+
+
+def report_mark(store: SweepStore, uri: str) -> str:
+    """Return a value that changes with each pass; empty before the first."""
+    try:
+        return file_mark(_report_path(store, uri))
+    except OSError:
+        return ""
+
+
+def _report_path(store: SweepStore, uri: str) -> Path:
+    return sync_folder(store, uri) / "report.json"
 
 
 def without_export(remark: str) -> str:
@@ -144,7 +157,7 @@ class Tracker:
                 remark=remark,
                 experiment_id=view.runs.experiment_id if view else "",
             )
-            write_json(sync_folder(self.store, self.uri) / "report.json", asdict(report))
+            write_json(_report_path(self.store, self.uri), asdict(report))
         self._view = None if problems else view
         return report
 

@@ -128,7 +128,7 @@ class TrialSync:
             position = self._runs.send_files(position, _result_files(trial, record))
             for path in _added_afterwards(trial):
                 position = self._runs.send_files(position, [path], path.parent.name)
-        except OSError:  # points may fit even if there is no room for files
+        except Exception:  # points may fit without room for files, or without the files' own store
             client.log_batch(run_id, metrics=metrics, params=new_params, synchronous=True)
             raise
         tag_values = {**state_tags(record), GROUP_TAG: group}

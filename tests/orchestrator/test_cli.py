@@ -753,6 +753,19 @@ def test_a_label_is_shown_as_it_is(folder: Path, capsys: pytest.CaptureFixture[s
     assert f"\nwarning of {label}\n" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("folder")
+def test_a_file_system_without_locks_is_a_sentence(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    no_locks = Mock(side_effect=OSError(errno.ENOLCK, "No locks available"))
+    monkeypatch.setattr("recrl.orchestrator.files.locks.fcntl.flock", no_locks)
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.CANNOT_RUN
+    assert capsys.readouterr().err == (
+        "recrl-sweep: the file system of the results has no locks (Lustre and NFS can be mounted with them); "
+        "keep the sweep elsewhere, by --root or --storage\n"
+    )
+
+
 def test_a_root_below_a_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "grid.yaml").write_text("name: x")
     with pytest.raises(SystemExit):

@@ -16,6 +16,7 @@ from contextlib import closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from unittest.mock import Mock
 
 import pandas as pd
 import pytest
@@ -24,12 +25,14 @@ from sqlalchemy import make_url
 from recrl.analysis.data import sweep_data
 from recrl.analysis.report import table_files as sweep_tables
 from recrl.environments.cmdp import CostLimits
+from recrl.orchestrator.cli.launch import MlflowWarning
 from recrl.orchestrator.cli.main import main
 from recrl.orchestrator.errors import RecrlError, TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.files.trial_store import TrialStore
+from recrl.orchestrator.launch_grid import LaunchOptions
 from recrl.orchestrator.process_scope import process_scope
 from recrl.orchestrator.spec import TrialStatus
 from recrl.orchestrator.tracking import background_sync, client, mlflow_sync
@@ -702,6 +705,19 @@ def test_where_files_do_not_fit_the_curves_are_there(write: Callable[..., SweepS
     assert runs(store)[NONE].data.tags["recrl.status"] == "complete"
 
 
+def test_without_the_library_of_the_files_store_the_curves_are_there(
+    write: Callable[..., SweepStore], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = write()
+    uri = tracking_uri(store, None)
+    missing = Mock(side_effect=ModuleNotFoundError("No module named 'boto3'"))
+    monkeypatch.setattr("recrl.orchestrator.tracking.mlflow_runs.SweepRuns.send_files", missing)
+    assert "No module named 'boto3'" in sync(store, uri).problem
+    assert runs(store)[NONE].data.metrics.keys() >= {"train/return", "summary/deploy_return"}
+    monkeypatch.undo()
+    assert sync(store, uri).is_up_to_date
+
+
 def test_rows_that_were_cut_back_are_gone_from_mlflow_too(
     half_and_done: tuple[SweepStore, SweepStore],
 ) -> None:
@@ -989,13 +1005,19 @@ def closed_port() -> Iterator[int]:
 def test_a_server_that_is_away_costs_seconds_and_is_named(
     made_up_sweep: Callable[..., SweepStore], closed_port: int
 ) -> None:
-    store = made_up_sweep(**SMALL)
+    store, uri = made_up_sweep(**SMALL), f"http://127.0.0.1:{closed_port}"
+    warning = MlflowWarning(store, LaunchOptions(store.folder.parent, tracking_uri=uri))
+    assert warning.once() == ""
     begun = time.monotonic()
-    report = sync(store, f"http://127.0.0.1:{closed_port}")
+    report = sync(store, uri)
     assert time.monotonic() - begun < 60.0  # by itself MLflow would try for four minutes
     assert (report.trials, report.behind, report.points) == (2, 2, 0)
     assert "Connection refused" in report.problem
     assert not report.is_up_to_date
+    said = warning.once()  # during a launch
+    assert said == f"MLflow is behind ({report.problem}); training goes on, and it is tried again"
+    assert warning.once() == ""
+    assert MlflowWarning(store, LaunchOptions(store.folder.parent, tracking_uri=uri)).once() == ""
 
 
 def test_what_was_missed_is_sent_when_mlflow_is_back(
