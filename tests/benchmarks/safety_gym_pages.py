@@ -38,7 +38,7 @@ AGENTS = ("ppo-lag", "cpo")
 TASKS = ("CarGoal2", "CarButton2", "CarPush2")
 LEVEL_1 = "level1"
 PAPER_PRESET = "paper-preset"
-LONG = "long-curricula"  # the paper's number of steps
+LONG, LONG_EARLY = "long-curricula", "long-early"  # the paper's number of steps
 LEVEL_1_TASKS = ("CarGoal1", "CarButton1", "CarPush1")
 STEPS_UNDER_LIMIT = ("none", "none-short", "linear", "linear-early")  # differ in these on CarGoal2
 NOISE = ("none", "dynamic", "dynamic-without-noise")
@@ -248,7 +248,7 @@ def tables() -> Iterator[tuple[Path, str, list[str]]]:
             (DETAILS, name, policies(rows_of(f"{name}.csv")))
             for name in (*CONFIRMATIONS, LEVEL_1, PAPER_PRESET)
         ),
-        (STEPS, LONG, policies(rows_of(f"{LONG}.csv"))),
+        (STEPS, LONG, policies(rows_of(f"{LONG}.csv", f"{LONG_EARLY}.csv"))),
         (DETAILS, "steps under the limit", policies(of_question(everything, STEPS_UNDER_LIMIT))),
         (DETAILS, "noise", policies(of_question(current, NOISE, TASKS))),
     )

@@ -33,6 +33,7 @@ from tests.benchmarks.safety_gym_pages import (
     FRESH,
     LEVEL_1,
     LONG,
+    LONG_EARLY,
     MULTIPLIERS,
     NOISE,
     PAPER_PRESET,
@@ -51,6 +52,16 @@ LIMIT = 25.0
 COLOURS = 128  # of a figure in the documentation
 TABLE_PARTS = ("table", "table-cpo")  # one archive would be too large for the repository
 PERIOD, LONG_PERIOD = 250_000, 2_000_000  # steps, of a curve
+FOLDER = "results/safety-gym"
+JUDGED = {  # options of confirmations.py
+    **{
+        name: " ".join(["--earlier", *(f"{FOLDER}/{it}" for it in earlier)])
+        for name, earlier in CONFIRMATIONS.items()
+    },
+    LEVEL_1: "",
+    LONG: f"--shorter {FOLDER}/goal-confirm.csv",
+    LONG_EARLY: f"--controls {FOLDER}/{LONG}.csv",
+}
 LABELS = ("ppo-lag min-std", "cpo")  # of each agent in the tables for the power
 COUNTED = ("agents.csv", *PILOT, "margin-control.csv", FRESH, "button-confirm.csv")  # for the power
 
@@ -75,7 +86,7 @@ def write_rows_and_tests(archives: Mapping[str, Path]) -> None:
     scripts = "../../tests/benchmarks"
     finals = {
         **archives,
-        **{name: archive_of(name) for name in (*CONFIRMATIONS, LEVEL_1, PAPER_PRESET, LONG)},
+        **{name: archive_of(name) for name in (*JUDGED, PAPER_PRESET)},
     }
     rows = [f"{scripts}/final_policies.py {path} --to {it}.csv" for it, path in finals.items()]
     phases = [
@@ -90,18 +101,15 @@ def write_rows_and_tests(archives: Mapping[str, Path]) -> None:
         for policy in POLICIES
     ]
     (RESULTS / "table-differences.txt").write_text(transcript(tests))
-    tables = " ".join(f"results/safety-gym/{name}" for name in COUNTED)
+    tables = " ".join(f"{FOLDER}/{name}" for name in COUNTED)
     powers = [
         f"tests/benchmarks/power.py {tables} --agents {labels} --tests {tests} --difference 1"
         for labels in LABELS
         for tests in (1, 24)
     ]
     (RESULTS / "power.txt").write_text(transcript(powers, ROOT))
-    for name in (*CONFIRMATIONS, LEVEL_1, LONG):
-        earlier = " ".join(f"results/safety-gym/{it}" for it in CONFIRMATIONS.get(name, ()))
-        before = f" --earlier {earlier}" if earlier else ""
-        before += " --shorter results/safety-gym/goal-confirm.csv" if name == LONG else ""
-        judge = f"-m tests.benchmarks.confirmations results/safety-gym/{name}.csv{before}"
+    for name, options in JUDGED.items():
+        judge = f"-m tests.benchmarks.confirmations {FOLDER}/{name}.csv {options}".rstrip()
         (RESULTS / f"{name}.txt").write_text(transcript([judge], ROOT))
 
 
@@ -220,11 +228,13 @@ def main() -> None:
         for policy in POLICIES:
             counts += limit_counts(rows_of(*names), policy)
     (RESULTS / "table-limit.txt").write_text("\n".join([*counts, ""]))
-    of_archive = {it: recrl.load_sweep(archive_of(it)).updates for it in (PAPER_PRESET, LONG)}
+    periods = {PAPER_PRESET: PERIOD, LONG: LONG_PERIOD, LONG_EARLY: LONG_PERIOD}
     curves = {
         "steps-under-limit-curve": curve(of_question(updates, STEPS_UNDER_LIMIT)),
-        f"{PAPER_PRESET}-learning": curve(of_archive[PAPER_PRESET]),
-        f"{LONG}-learning": curve(of_archive[LONG], LONG_PERIOD),
+        **{
+            f"{name}-learning": curve(recrl.load_sweep(archive_of(name)).updates, period)
+            for name, period in periods.items()
+        },
     }
     for name, rows in curves.items():
         rows.to_csv(RESULTS / f"{name}.csv", index=False)
