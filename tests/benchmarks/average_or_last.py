@@ -66,19 +66,26 @@ def value(policy: FinalPolicy, spec: TrialSpec, episodes: int | None) -> dict[st
     }
 
 
+def labels_of(spec: TrialSpec) -> dict[str, Any]:
+    """The first columns of the rows of a trial."""
+    return {
+        "task": spec.task.label,
+        "agent": spec.agent.label,
+        "method": spec.method.label,
+        "seed": spec.seed,
+        "limit": spec.deploy_limits.array[0],
+    }
+
+
 def compared(sweep: Path, episodes: int | None = None) -> pd.DataFrame:
     """A row a trial and policy."""
     rows: list[dict[str, Any]] = []
     for trial in SweepStore(sweep.parent, sweep.name).trials():
         spec = trial.spec
-        keys = {
-            "task": spec.task.label,
-            "agent": spec.agent.label,
-            "method": spec.method.label,
-            "seed": spec.seed,
-            "limit": spec.deploy_limits.array[0],
-        }
-        rows += [{**keys, "policy": name, **value(each, spec, episodes)} for name, each in policies(trial)]
+        rows += [
+            {**labels_of(spec), "policy": name, **value(each, spec, episodes)}
+            for name, each in policies(trial)
+        ]
     return pd.DataFrame(rows).round(4)
 
 

@@ -29,7 +29,7 @@ from recrl.orchestrator.grid.checking import read_grid
 from recrl.orchestrator.spec import TrialSpec
 from recrl.orchestrator.trial.trial import Trial, TrialSeeds
 from recrl.teachers.registry import make_teacher
-from tests.benchmarks.average_or_last import value
+from tests.benchmarks.average_or_last import labels_of, value
 
 DECAY = 0.9  # of both averages, the default of policy_average
 
@@ -59,16 +59,11 @@ def final_policies(spec: TrialSpec, folder: Path) -> dict[str, FinalPolicy]:
 
 def rows_of(spec: TrialSpec) -> pd.DataFrame:
     """Train and evaluate; a row a policy."""
-    keys = {
-        "task": spec.task.label,
-        "agent": spec.agent.label,
-        "method": spec.method.label,
-        "seed": spec.seed,
-        "limit": spec.deploy_limits.array[0],
-    }
     with tempfile.TemporaryDirectory() as folder:
         policies = final_policies(spec, Path(folder) / spec.trial_id)
-        values = [{**keys, "policy": name, **value(it, spec, None)} for name, it in policies.items()]
+        values = [
+            {**labels_of(spec), "policy": name, **value(it, spec, None)} for name, it in policies.items()
+        ]
     return pd.DataFrame(values).round(4)
 
 
