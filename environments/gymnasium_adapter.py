@@ -415,8 +415,9 @@ def _declared_horizon(environment: Environment) -> int | None:
 def _time_limits(environment: Environment) -> Iterator[int]:
     """Yield the steps of each ``TimeLimit`` around an environment."""
     while isinstance(environment, gymnasium.Wrapper):
-        if isinstance(environment, TimeLimit):
-            yield environment._max_episode_steps  # there is no public name
+        steps = getattr(environment, "_max_episode_steps", None)  # there is no public name
+        if isinstance(environment, TimeLimit) and isinstance(steps, int):
+            yield steps
         environment = environment.env
 
 

@@ -16,14 +16,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from recrl.orchestrator.capacity import trials_at_once, trials_on_gpus
 from recrl.orchestrator.errors import RecrlError
+from recrl.orchestrator.executor_kind import ExecutorKind
 from recrl.orchestrator.executors import Executor, InlineExecutor
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import of_update
 from recrl.orchestrator.files.trial_store import TrialStore
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.file_models import Resources
-from recrl.orchestrator.launch_plan import Plan, TrialSelection, trials_at_once, trials_on_gpus
+from recrl.orchestrator.launch_plan import Plan, TrialSelection
 from recrl.orchestrator.remote.remote_sweep import sweep_place
 from recrl.orchestrator.report_refresh import refreshing
 from recrl.orchestrator.run_sweep import (
@@ -57,7 +59,7 @@ class LaunchOptions:
         max_concurrent: largest number of parallel trials; None for the grid's.
         address: of an existing Ray cluster; None to start one here.
         ship_package: whether to send recrl itself to that cluster.
-        executor: ``ray`` or ``inline``.
+        executor: the executor.
         mlflow: whether to log the sweep to MLflow.
         tracking_uri: of MLflow; None for the database in the sweep's folder.
         figures: whether to draw figures and the report, during the sweep and at its end.
@@ -69,7 +71,7 @@ class LaunchOptions:
     max_concurrent: int | None = None
     address: str | None = None
     ship_package: bool = False
-    executor: str = "ray"
+    executor: ExecutorKind = ExecutorKind.RAY
     mlflow: bool = True
     tracking_uri: str | None = None
     figures: bool = True
@@ -117,6 +119,9 @@ class LaunchListener:
     def failed_to_draw(self, error: Exception) -> None:
         """Called if figures or tables cannot be made; the launch continues."""
 
+    def failed_to_write_outcomes(self, error: Exception) -> None:
+        """Called if, without figures, the outcomes for MLflow cannot be written; the launch continues."""
+
     def filming(self, trials: Sequence[TrialStore]) -> None:
         """Called before these trials are filmed."""
 
@@ -140,7 +145,7 @@ def launch_grid(grid: GridSpec, options: LaunchOptions, listener: LaunchListener
         grid.resources,
         address=options.address,
         max_concurrent=options.max_concurrent,
-        inline=options.executor == "inline",
+        inline=options.executor is ExecutorKind.INLINE,
     )
     uri = tracking_uri(store, options.tracking_uri) if options.mlflow else None
     stop = threading.Event()
@@ -224,7 +229,7 @@ def _listening(stop: threading.Event, say_stopping: Callable[[], None]) -> Abstr
 def _executor(grid: GridSpec, place: SweepPlace, options: LaunchOptions) -> Executor:
     if options.ship_package and not options.address:
         raise RecrlError("--ship-package: needs an --address to ship to")
-    if options.executor == "inline":
+    if options.executor is ExecutorKind.INLINE:
         return _inline_executor(grid, options)
     if place.uri.startswith("memory://"):
         raise RecrlError(f"{place.uri}: is memory of a single process; use --executor inline")
@@ -275,7 +280,7 @@ def _write_outcomes(sweep: Sweep, store: SweepStore, listener: LaunchListener) -
         write_outcomes(sweep, store.figures_folder)
     except Exception as error:  # MLflow must still be updated
         logger.debug("outcomes of %s", store.name, exc_info=True)
-        listener.failed_to_draw(error)
+        listener.failed_to_write_outcomes(error)
 
 
 def _film(

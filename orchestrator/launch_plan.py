@@ -5,13 +5,10 @@ The plan alone decides which trials run: a launch executes it, ``recrl-sweep pla
 
 from __future__ import annotations
 
-import os
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from pathlib import Path
 
 from recrl.orchestrator.counting import counted
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -242,45 +239,6 @@ def unmeasured(plan: Plan) -> tuple[TrialSpec, ...]:
     known = {kind_of(trial.spec) for trial in timed}
     kinds = {kind_of(spec): spec for spec in reversed(plan.to_do)}
     return tuple(spec for kind, spec in reversed(kinds.items()) if kind not in known)
-
-
-def trials_at_once(*, cpus_per_trial: float, max_concurrent: int | None, cores: int | None = None) -> int:
-    """Return how many trials fit on a number of cores, by default this machine's; at least 1."""
-    fitting = max(1, trials_within(cores or usable_cores(), cpus_per_trial))
-    return min(fitting, max_concurrent or fitting)
-
-
-def trials_within(there: float, asked: float) -> int:
-    """Return for how many trials an amount of a resource is enough, without errors of rounding.
-
-    >>> trials_within(7.0, 0.07), trials_within(2.0, 0.75)
-    (100, 2)
-    """
-    return int(there / asked + 1e-9)
-
-
-def trials_on_gpus(gpus: float, gpus_per_trial: float) -> int:
-    """Return how many trials fit on the GPUs of one machine, at least 0.
-
-    Args:
-        gpus: of the machine, at least 0.
-        gpus_per_trial: above 0, and whole above 1. Below 1 several trials share a GPU; none uses two.
-    """
-    on_each = trials_within(1.0, gpus_per_trial)
-    return int(gpus) * on_each if on_each else int(gpus / gpus_per_trial)
-
-
-def usable_cores(quota_file: Path = Path("/sys/fs/cgroup/cpu.max")) -> int:
-    """Return the number of cores that this process may use, at least 1; in a container maybe not all.
-
-    Args:
-        quota_file: the control group's quota and period in microseconds, or ``max`` and the period.
-    """
-    cores = len(os.sched_getaffinity(0))
-    with suppress(OSError, ValueError):
-        quota, period = quota_file.read_text().split()
-        cores = min(cores, max(1, int(quota) // int(period)))
-    return cores
 
 
 def _planned_action(record: TrialRecord, selection: TrialSelection) -> PlannedAction:

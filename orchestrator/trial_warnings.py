@@ -101,7 +101,7 @@ def unknown_horizon_sentence(tasks: Sequence[str]) -> str:
 
 
 def code_warnings(ran: Sequence[tuple[TrialStatus, CodeComparison]]) -> list[str]:
-    """Return sentences on trials that ran other code or libraries than now, or code that is not found.
+    """Return sentences on trials that ran other code or libraries than now, or code that is not known.
 
     Args:
         ran: status and comparison of each trial.
@@ -110,6 +110,9 @@ def code_warnings(ran: Sequence[tuple[TrialStatus, CodeComparison]]) -> list[str
         other_code_sentence(ran),
         missing_modules_sentence(code.missing for _, code in ran),
         other_versions_sentence(code.versions for _, code in ran),
+        unreadable_code_sentence(
+            [it.unreadable for status, it in ran if it.unreadable and status is not TrialStatus.DAMAGED]
+        ),
     )
     return [*filter(None, sentences)]
 
@@ -168,6 +171,21 @@ def other_versions_sentence(versions: Iterable[Collection[str]]) -> str:
     return (
         f"{counted(len(others), 'trial')} ran with other versions of libraries than are installed now "
         f"({listed}); the same settings may give other results"
+    )
+
+
+def unreadable_code_sentence(errors: Sequence[str]) -> str:
+    """Describe trials not known to be damaged of which no file says what code they ran; empty for none.
+
+    Args:
+        errors: why each file cannot be read.
+    """
+    if not errors:
+        return ""
+    return (
+        f"the code of {counted(len(errors), 'trial')} was not checked for changes, because the file that "
+        f"names it cannot be read ({errors[0]}); recrl-sweep check lists damaged files, and launch "
+        "--rerun-damaged runs their trials again"
     )
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import json
+import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,6 +20,8 @@ from recrl.environments.finite.exact_solver import evaluate_policy
 from recrl.environments.finite.finite_cmdp import FiniteCMDP, FiniteVectorEnv
 from recrl.environments.registry import find_task, make_vector, task_options
 from recrl.orchestrator.errors import USERS_ERRORS
+
+logger = logging.getLogger("recrl.sweep_data")
 
 STOCHASTIC, DETERMINISTIC = "stochastic", "deterministic"
 MISFIT = "policy tables that do not fit their task, so that the values are sampled"
@@ -81,6 +84,7 @@ def finite_model(name: str, options: Mapping[str, Any]) -> FiniteCMDP | None:
             return None
         return _model(name, task_options(name, options).model_dump_json())
     except USERS_ERRORS:
+        logger.debug("tables of %s", name, exc_info=True)
         return None
 
 

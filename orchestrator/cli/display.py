@@ -28,7 +28,7 @@ LOG_SECONDS = 0.5
 SHOWN_RUNNING = 8
 WRAPPED = ("verdict", "summary")  # columns of sentences, wrapped on a narrow terminal
 
-FROM_THE_BEGINNING = (PlannedAction.REPAIR, PlannedAction.DAMAGED, PlannedAction.RERUN)
+UNREAD = (PlannedAction.REPAIR, PlannedAction.DAMAGED)  # how far their intact files reach is not known yet
 _STYLES = {
     "complete": "green",
     "running": "cyan",
@@ -46,13 +46,13 @@ def plan_table(plan: Plan) -> Table:
     """Return a table of all trials and their planned actions."""
     table = _table("trial", "seed", "action", "done", "id")
     for trial in plan.trials:
-        done = 0 if trial.action in FROM_THE_BEGINNING else trial.record.env_steps
+        done = 0 if trial.action is PlannedAction.RERUN else trial.record.env_steps
         fraction = 1.0 if trial.action is PlannedAction.COMPLETE else done / trial.spec.total_steps
         table.add_row(
             f"{trial.spec.task.label} {trial.spec.agent.label} {trial.spec.method.label}",
             str(trial.spec.seed),
             _styled(trial.action),
-            f"{min(1.0, fraction):.0%}",
+            "?" if trial.action in UNREAD else f"{min(1.0, fraction):.0%}",
             trial.spec.trial_id,
         )
     return table

@@ -18,6 +18,7 @@ from recrl.orchestrator.cli.status import say_failures
 from recrl.orchestrator.cli.sweeps import command_line
 from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import RecrlError, described
+from recrl.orchestrator.executor_kind import ExecutorKind
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_store import TrialStore
@@ -47,7 +48,7 @@ def run_launch(request: LaunchRequest, console: Console) -> ExitCode:
         max_concurrent=request.max_concurrent,
         address=request.address,
         ship_package=request.ship_package,
-        executor=request.executor,
+        executor=ExecutorKind(request.executor),
         mlflow=request.mlflow,
         tracking_uri=request.tracking_uri,
         figures=request.figures,
@@ -102,7 +103,7 @@ class _Printer(LaunchListener):
             self._has_run = True
             yield
             return
-        if self._options.executor == "ray":
+        if self._options.executor is ExecutorKind.RAY:
             address = self._options.address
             doing = f"Connecting to the Ray cluster at {address}" if address else "Starting Ray"
             say(self._console, f"{doing} ...")
@@ -140,6 +141,11 @@ class _Printer(LaunchListener):
         else:
             again = command_line("figures", self._store)
             say(self._console, f"           this is a bug in recrl; for its traceback: {again}")
+
+    def failed_to_write_outcomes(self, error: Exception) -> None:
+        """Print the error, and how to try again."""
+        say(self._console, f"MLflow     has no outcomes of the final policies ({described(error)})")
+        say(self._console, f"           to send them later: {command_line('sync', self._store)}")
 
     def filming(self, trials: Sequence[TrialStore]) -> None:
         """Print the place of the videos."""

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 
 from recrl.orchestrator.cli import argument_types as types
 from recrl.orchestrator.cli.argument_fields import Request, by_flag, by_place
+from recrl.orchestrator.executor_kind import ExecutorKind
 from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 
 VIDEOS = ("gif", "mp4")
@@ -107,8 +108,8 @@ class LaunchRequest(GridRequest):
     )
     tracking_uri: str | None = by_flag(**_TRACKING)
     executor: str = by_flag(
-        choices=("ray", "inline"),
-        default="ray",
+        choices=tuple(map(str, ExecutorKind)),
+        default=str(ExecutorKind.RAY),
         help="ray: in parallel on all cores or a cluster (default); inline: one after the other in this "
         "process, for debuggers",
     )

@@ -1,32 +1,6 @@
 """The files of a sweep, from which everything else (status, MLflow, figures) is derived.
 
-    <root>/<sweep>/
-        sweep.json              name, creation time, recrl's version
-        grid.yaml               the grid file as given to the last launch
-        trials.jsonl            number of trials of that grid, then one TrialSpec per line, in order
-        lock                    held by the process that runs the sweep
-        stop.request            exists while that process is asked to stop
-        storage.json            of a local copy: the address of the object store
-        figures/                output of ``recrl-sweep figures``
-        replays/                output of ``recrl-sweep replay``
-        mlflow.db, mlartifacts/ the default MLflow store
-        mlflow-sync/            how far each MLflow store is up to date
-        trials/<task>__<agent>__<method>__s<seed>__<id>/
-            spec.json           the TrialSpec
-            state.json          the TrialRecord: status, progress, lease, committed lengths and digests
-            episodes.csv        one row per episode: EPISODE_COLUMNS and one cost_i, limit_i per cost
-            updates.csv         one row per policy update: UPDATE_COLUMNS and the agent's own metrics
-            events.jsonl        one line per event: noise added, limits measured, phase changed
-            evaluation.csv      one row per episode of the final evaluations: EVALUATION_COLUMNS
-            policy.csv          of finite tasks: the final policy, one row per state, action_j per action
-            evaluations/        results of ``recrl-sweep evaluate``; not needed by the trial
-            videos/             episodes filmed by ``recrl-sweep evaluate --video``; not needed by the trial
-            checkpoints/        the newest two checkpoints
-            provenance.json     of each attempt: versions, commit, machine, digests of the code
-            log.txt, error.txt  the trial's log; the traceback of a failed trial
-            aside/              damaged or replaced files, moved there when an attempt began
-            rerun.request       exists until an attempt has moved the files of a replaced run to aside/run-...
-            .reserve            disk space for the final record of a running trial, if the disk is full
+``docs/reference/files.md`` lists all files, their columns and what each holds.
 
 Rules. Small files are written atomically. Only ``TrialWriter.commit`` appends rows. It syncs them, then
 writes a checkpoint with the files' lengths and digests, then ``state.json``. After a crash in between, a

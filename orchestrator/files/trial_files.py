@@ -1,4 +1,4 @@
-"""The files of a trial: their names and kinds, columns and paths; ``sweep_store`` describes them.
+"""The files of a trial: their names and kinds, columns and paths; ``docs/reference/files.md`` describes them.
 
 A file that trials have is declared once, as an attribute of ``TrialFiles``. Its kind decides how a writer
 commits it, and whether and how it is uploaded to an object store.
@@ -67,7 +67,7 @@ class TrialFile(PathIn):
 
 
 class TrialFiles:
-    """The files and folders of one trial; ``sweep_store`` says what each holds.
+    """The files and folders of one trial; ``docs/reference/files.md`` says what each holds.
 
     Attributes:
         folder: the trial's folder; its name is ``TrialSpec.folder_name``.

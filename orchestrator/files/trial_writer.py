@@ -172,13 +172,16 @@ class TrialWriter:
         self._write_csv(self.store.policy_path, rows)
 
     def add_provenance(self, provenance: Mapping[str, Any]) -> None:
-        """Append the provenance of this attempt to that of earlier ones."""
+        """Add values to the provenance of this attempt, which stands after that of earlier ones."""
         with self._lease():
             name = self.store.provenance_path.name
             before = self.store.provenance() if name in self._whole else []
             if name not in self._whole:
                 self.store.move_aside(self.store.provenance_path)
-            attempts = [*before, {"attempt": self.record.attempt, **provenance}]
+            attempt = self.record.attempt
+            earlier = [it for it in before if it["attempt"] != attempt]
+            values = next((it for it in before if it["attempt"] == attempt), {"attempt": attempt})
+            attempts = [*earlier, {**values, **provenance}]
             write_sealed(self.store.provenance_path, {"attempts": attempts}, version=PROVENANCE_FORMAT)
             self._whole[name] = Extent.of(self.store.provenance_path.read_bytes())
             committed = {**self.record.extents, name: self._whole[name]}

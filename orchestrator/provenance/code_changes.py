@@ -114,11 +114,14 @@ class CodeComparison:
         missing: the top-level packages and modules that it ran and that are not found now. So it is unknown
             whether their code differs. Empty if other code differs.
         versions: of libraries in an attempt, where they are others now, such as "torch 2.12.0, now 2.13.0".
+        unreadable: why the file that names the code could not be read, so that nothing was compared; empty
+            if it was read.
     """
 
     changed: frozenset[str] = frozenset()
     missing: frozenset[str] = frozenset()
     versions: frozenset[str] = frozenset()
+    unreadable: str = ""
 
     @property
     def differs(self) -> bool:
@@ -155,11 +158,11 @@ def library_versions(attempt: Mapping[str, Any]) -> dict[str, str]:
 def compare_files(
     trial: TrialStore, spec: TrialSpec, installed: InstalledCode | None = None
 ) -> CodeComparison:
-    """Apply ``compare`` to the trial's files; nothing differs or is missing if these are damaged."""
+    """Apply ``compare`` to the trial's files; ``unreadable`` says why that is not possible."""
     try:
         return compare(trial.provenance(), spec, installed)
-    except StorageError:
-        return CodeComparison()
+    except StorageError as error:
+        return CodeComparison(unreadable=str(error))
 
 
 def _without_builds(packages: Mapping[str, Any]) -> dict[str, str]:

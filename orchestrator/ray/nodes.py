@@ -14,8 +14,8 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from recrl.orchestrator.capacity import trials_on_gpus, trials_within
 from recrl.orchestrator.errors import ClusterError, first_line
-from recrl.orchestrator.launch_plan import trials_on_gpus, trials_within
 from recrl.orchestrator.provenance.versions import DISTRIBUTION, LIBRARIES
 
 DISTRIBUTIONS = (DISTRIBUTION, "ray", *LIBRARIES)

@@ -36,12 +36,12 @@ import ray
 from ray import tune
 from ray.tune.search import BasicVariantGenerator
 
+from recrl.orchestrator.capacity import usable_cores
 from recrl.orchestrator.errors import ClusterError
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.stop_file import StopSignal
 from recrl.orchestrator.files.trial_writer import COMMIT_SECONDS
 from recrl.orchestrator.grid.file_models import Resources
-from recrl.orchestrator.launch_plan import usable_cores
 from recrl.orchestrator.ray.clusters import QUIET, WORKER, existing_cluster, local_cluster
 from recrl.orchestrator.ray.hang_watchdog import HangWatchdog
 from recrl.orchestrator.ray.nodes import check_gpus, check_nodes, trials_that_fit

@@ -9,6 +9,7 @@ complete trial is not in it.
 from __future__ import annotations
 
 import csv
+import logging
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -26,6 +27,8 @@ from recrl.orchestrator.files.trial_record import TrialRecord
 from recrl.orchestrator.number_texts import cost_with_error, number
 from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.tracking.positions import file_mark
+
+logger = logging.getLogger("recrl.mlflow")
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,7 @@ class FinalOutcomes:
         except FileNotFoundError:
             mark, outcomes = "", []
         except (KeyError, TypeError, ValueError):  # another version wrote it, or it is being written
+            logger.debug("outcomes of %s", self._store.name, exc_info=True)
             return
         self._mark = mark
         self._found = {outcome.trial_id: outcome for outcome in outcomes}

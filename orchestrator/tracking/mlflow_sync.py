@@ -20,6 +20,7 @@ export file (``export_download``): MLflow's points are only for its charts.
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -39,6 +40,8 @@ from recrl.orchestrator.tracking.mlflow_runs import SweepRuns
 from recrl.orchestrator.tracking.positions import exclusive, file_mark, sync_folder
 from recrl.orchestrator.tracking.sweep_sync import SweepSync
 from recrl.orchestrator.tracking.trial_sync import TrialSync
+
+logger = logging.getLogger("recrl.mlflow")
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,7 @@ class Tracker:
                         points.append(sent)
                 remark = view.sweep.show(live=live)
             except Exception as error:
+                logger.debug("MLflow runs of %s", self.store.name, exc_info=True)
                 problems.append(one_line(error))
             report = SyncReport(
                 trials=len(trials),
@@ -194,6 +198,7 @@ def _kept(problems: list[str], unreadable: list[str], trial: TrialStore) -> Iter
     except Exception as error:
         if is_away(error):
             raise
+        logger.debug("MLflow run of %s", trial.folder.name, exc_info=True)
         problems.append(f"{trial.folder.name}: {one_line(error)}")
 
 

@@ -28,7 +28,7 @@ from recrl.orchestrator.spec import TrialSpec, TrialStatus
 from recrl.orchestrator.trial.device import device_name, learning_on
 from recrl.orchestrator.trial.heartbeat import Heartbeat
 from recrl.orchestrator.trial.torch_settings import torch_settings
-from recrl.orchestrator.trial.trial import Trial, open_environments
+from recrl.orchestrator.trial.trial import Trial
 from recrl.teachers.registry import make_teacher
 from recrl.teachers.teacher import Teacher
 
@@ -69,6 +69,8 @@ def run_trial(
     heartbeat = Heartbeat(life.beat, seconds=HEARTBEAT_SECONDS)
     with heartbeat.beating(), ExitStack() as at_end:  # preparation may take minutes
         trial = life.of(at_end.enter_context(closing(Trial(spec, writer, teacher))))
+        if len(trial.cost_names) > 1:
+            writer.add_provenance({"cost_names": list(trial.cost_names)})  # for titles
         committed = time.monotonic()
         while not trial.learned and not should_stop():
             with _located(f"in update {trial.update + 1}", writer):
@@ -176,11 +178,8 @@ def run_recorded(
         TeacherUnavailableError: the teacher does not answer; the trial waits to be resumed.
         SystemExit: of SIGTERM, before the trial began or while its end was recorded.
     """
-    provenance = {
-        **collect_provenance(),
-        "code": code_of(spec),
-        **_cost_names(spec),
-    }  # waits for git without a heartbeat, so before the trial begins
+    # waits for git without a heartbeat, so before the trial begins
+    provenance = {**collect_provenance(), "code": code_of(spec)}
     try:
         writer = store.begin(spec)
     except StorageError as error:
@@ -214,17 +213,6 @@ def run_recorded(
             text = shown(f"{described_with_place(error)}{notes}")
             return _close(writer, TrialStatus.FAILED, error=text, traceback=shown(traceback.format_exc()))
         return store.record().status
-
-
-def _cost_names(spec: TrialSpec) -> dict[str, list[str]]:
-    """Return the names of a task's costs for titles, if it has several and can be built."""
-    if len(spec.deploy_limits) == 1:
-        return {}
-    try:
-        with open_environments(spec, 1) as environments:
-            return {"cost_names": list(environments.cmdp.cost_names)}
-    except USERS_ERRORS:  # the trial itself will say so
-        return {}
 
 
 def _close(writer: TrialWriter, status: TrialStatus, *, error: str = "", traceback: str = "") -> TrialStatus:

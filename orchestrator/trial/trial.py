@@ -119,6 +119,11 @@ class Trial:
             logger.info("resumed after update %d, %d environment steps", self.update, self.env_steps)
 
     @property
+    def cost_names(self) -> tuple[str, ...]:
+        """The names of the task's costs."""
+        return self._cmdp.cost_names
+
+    @property
     def phase(self) -> Phase:
         """The phase of the next update."""
         return Phase.TRAINING if self.env_steps < self.spec.train_steps else Phase.DEPLOYMENT

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from recrl._results import Policy, following, load_sweep, policy_of
 from recrl.environments.plugins import modules_here
 from recrl.orchestrator.errors import NO_PATH, NO_ROOM, GridError, RecrlError, StorageError, described
+from recrl.orchestrator.executor_kind import ExecutorKind
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.sweep_store import SweepStore
@@ -25,7 +26,7 @@ from recrl.orchestrator.files.trial_files import DEFAULT_ROOT
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.checking import parse_grid, read_grid
 from recrl.orchestrator.launch_grid import LaunchListener, LaunchOptions, launch_grid
-from recrl.orchestrator.launch_plan import Plan
+from recrl.orchestrator.launch_plan import Plan, TrialSelection
 from recrl.orchestrator.located_yaml import dump
 from recrl.orchestrator.spec import TrialStatus
 
@@ -80,11 +81,12 @@ def launch(
     executor: str = "ray",
     address: str | None = None,
     max_concurrent: int | None = None,
+    retry_failed: bool = False,
     mlflow: bool = True,
     figures: bool = True,
     progress: bool = True,
 ) -> Sweep:
-    """Run every trial of a grid that is not complete, as ``recrl-sweep launch`` does.
+    """Run every trial of a grid that is neither complete nor failed, as ``recrl-sweep launch`` does.
 
     The same call continues after a crash or Ctrl-C. It follows the grid's import paths.
 
@@ -95,6 +97,7 @@ def launch(
             process.
         address: of an existing Ray cluster; by default one is started here. Not with ``inline``.
         max_concurrent: largest number of parallel trials, at least 1; by default as many as fit.
+        retry_failed: whether to run failed trials again, from their last checkpoints.
         mlflow: whether to log the sweep to MLflow.
         figures: whether to draw figures and the report at the end.
         progress: whether to print progress and results.
@@ -119,15 +122,16 @@ def launch(
     from recrl.orchestrator.cli.launch import launch_and_print  # noqa: PLC0415
     from recrl.orchestrator.cli.output import TextConsole  # noqa: PLC0415
 
-    if executor not in ("ray", "inline"):
+    if executor not in list(ExecutorKind):
         raise RecrlError(f"executor: must be 'ray' or 'inline', got {executor!r}")
     if max_concurrent is not None and max_concurrent < 1:
         raise RecrlError(f"max_concurrent: must be at least 1, got {max_concurrent}")
     options = LaunchOptions(
         root=Path(root),
+        selection=TrialSelection(retry_failed=retry_failed),
         max_concurrent=max_concurrent,
         address=address,
-        executor=executor,
+        executor=ExecutorKind(executor),
         mlflow=mlflow,
         figures=figures,
     )
@@ -162,6 +166,10 @@ class _PlanWarnings(LaunchListener):
     def failed_to_draw(self, error: Exception) -> None:
         """Warn of figures that could not be drawn."""
         _warn([f"not all figures are drawn ({described(error)})"])
+
+    def failed_to_write_outcomes(self, error: Exception) -> None:
+        """Warn of outcomes that MLflow lacks."""
+        _warn([f"MLflow has no outcomes of the final policies ({described(error)})"])
 
 
 def _warn(sentences: Iterable[str]) -> None:
@@ -199,7 +207,8 @@ def train(
             list with one number per cost.
         train_limits: training limits d_t at the start, at least d_d, likewise; ``auto`` measures them.
         seed: of the trial, at least 0.
-        folder: for the files, as a sweep of one trial; the same call continues from there. None for no files.
+        folder: for the files, as a sweep of one trial; the same call continues from there, also after an
+            error. None for no files.
         progress: whether to show return and cost: in place on a terminal, elsewhere in one line per tenth of
             the updates.
         **run: other settings of a grid's section ``run``: ``deploy_fraction``, ``num_envs``,
@@ -240,7 +249,13 @@ def train(
         with shown_progress(progress):
             try:
                 sweep = launch(
-                    grid, root=place.parent, executor="inline", mlflow=False, figures=False, progress=False
+                    grid,
+                    root=place.parent,
+                    executor="inline",
+                    retry_failed=True,
+                    mlflow=False,
+                    figures=False,
+                    progress=False,
                 )
             except GridError as error:  # the grid's name is that of the folder
                 raise GridError([re.sub("^name: ", "folder: ", it) for it in error.problems]) from error

@@ -46,12 +46,16 @@ TRAININGS = [
     Training("pcpo", "continuous-bandit", (2.5,), 100, options=NO_BOUND),
     Training("focops", "two-state", (3.0,), 150),
     Training("focops", "two-state-2", (5.0, 2.0), 150, num_envs=128),
+    Training("focops", "continuous-bandit", (2.5,), 600, options=NO_BOUND),
     Training("p3o", "two-state", (3.0,), 200),
     Training("p3o", "two-state-2", (5.0, 2.0), 200, num_envs=128),
+    Training("p3o", "continuous-bandit", (2.5,), 600, options=NO_BOUND),
     Training("ipo", "two-state", (3.0,), 200),
     Training("ipo", "two-state-2", (5.0, 2.0), 200, seeds=0),
+    Training("ipo", "continuous-bandit", (2.5,), 600, options=NO_BOUND),
     Training("crpo", "two-state", (3.0,), 100),
     Training("crpo", "two-state-2", (5.0, 2.0), 300, num_envs=128),
+    Training("crpo", "continuous-bandit", (2.5,), 300, options=NO_BOUND),
 ]
 
 

@@ -497,6 +497,30 @@ def test_other_versions_of_libraries_are_said_where_a_launch_would_mix_them(
     assert sentence in capsys.readouterr().out.splitlines()
 
 
+def test_a_damaged_provenance_never_counts_as_unchanged_code(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One byte differs, so the file's length does not show it."""
+    assert main(["launch", "grid.yaml", *INLINE]) == ExitCode.OK
+    trial = SweepStore(folder / "runs", "small").trials()[0]
+    change(folder)
+    written = trial.provenance_path.read_bytes()
+    trial.provenance_path.write_bytes(written.replace(b'"code"', b'"c0de"'))
+    for command in (["plan", "grid.yaml", "--trust"], ["launch", "grid.yaml", *INLINE]):
+        capsys.readouterr()
+        assert main(command) == ExitCode.OK
+        (sentence,) = [line for line in capsys.readouterr().out.splitlines() if "not checked" in line]
+        assert sentence.startswith("warning: the code of 1 trial was not checked for changes, because ")
+        assert "provenance.json is not what was committed" in sentence
+        assert "launch --rerun-damaged" in sentence
+    trial.provenance_path.unlink()  # a trial that is damaged anyway is said to be so, once
+    capsys.readouterr()
+    assert main(["plan", "grid.yaml", "--trust"]) == ExitCode.OK
+    shown = capsys.readouterr().out
+    assert "1 damaged" in shown
+    assert "not checked" not in shown
+
+
 def test_the_sentences_count() -> None:
     assert other_versions_sentence([(), ()]) == ""
     unchanged = TrialStatus.COMPLETE, CodeComparison()

@@ -16,10 +16,7 @@ from recrl.orchestrator.launch_plan import (
     TrialSelection,
     estimate,
     make_plan,
-    trials_at_once,
-    trials_on_gpus,
     unmeasured,
-    usable_cores,
 )
 from recrl.orchestrator.spec import TrialSpec, TrialStatus
 
@@ -137,38 +134,6 @@ def test_nothing_to_do_takes_nothing(store: SweepStore) -> None:
     assert (found.wall_seconds, found.concurrent, found.gigabytes) == (0.0, 0, 0.0)
 
 
-def test_at_least_one_trial_fits_and_no_more_than_allowed() -> None:
-    assert trials_at_once(cpus_per_trial=1e6, max_concurrent=None) == 1
-    assert trials_at_once(cpus_per_trial=1e-3, max_concurrent=3) == 3
-
-
-@pytest.mark.parametrize(
-    ("gpus", "of_a_trial", "trials"),
-    [
-        (0, 1.0, 0),
-        (3, 1.0, 3),
-        (3, 2.0, 1),
-        (2, 0.5, 4),
-        (2, 0.6, 2),
-        (2, 0.4, 4),
-        (10, 0.1, 100),
-        (1, 0.3, 3),
-    ],
-)
-def test_trials_share_a_gpu_but_use_no_parts_of_two(gpus: int, of_a_trial: float, trials: int) -> None:
-    assert trials_on_gpus(gpus, of_a_trial) == trials
-
-
-@pytest.mark.parametrize(("text", "cores"), [("max 100000", 4), ("150000 100000", 1), ("300000 100000", 3)])
-def test_a_containers_quota_counts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, cores: int
-) -> None:
-    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(4)))
-    assert usable_cores(tmp_path / "cpu.max") == 4
-    (tmp_path / "cpu.max").write_text(f"{text}\n")
-    assert usable_cores(tmp_path / "cpu.max") == cores
-
-
 @pytest.mark.parametrize(
     ("gpus", "per_trial", "fitting"),
     [(0, 1.0, 1), (3, 1.0, 3), (2, 0.4, 4), (1, 0.1, 10), (3, 2.0, 1), (8, 0.0, 64)],
@@ -177,7 +142,7 @@ def test_no_more_trials_run_than_fit_on_the_gpus(
     monkeypatch: pytest.MonkeyPatch, gpus: int, per_trial: float, fitting: int
 ) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
-    monkeypatch.setattr("recrl.orchestrator.launch_plan.usable_cores", lambda: 64)
+    monkeypatch.setattr("recrl.orchestrator.capacity.usable_cores", lambda: 64)
     resources = Resources(cpus_per_trial=1, gpus_per_trial=per_trial)
     assert room(resources, address=None, max_concurrent=None)[0] == fitting
     assert room(resources, address=None, max_concurrent=64)[0] == fitting

@@ -39,6 +39,24 @@ def test_the_end_does_not_wait_for_a_drawing(tmp_path: Path, monkeypatch: pytest
     assert comm(int(path.read_text())) == ""
 
 
+def test_a_report_that_cannot_be_drawn_is_said_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    tries = tmp_path / "tries"
+    program = f"open({str(tries)!r}, 'a').write('.'); raise SystemExit('first line\\nno disk ***')"
+    monkeypatch.setattr(report_refresh, "sketch_command", lambda _: [sys.executable, "-c", program])
+    monkeypatch.setattr(report_refresh, "REST", 0.0)
+    with refreshing(SweepStore(tmp_path, "small"), first_seconds=0.0, interval_seconds=0.0):
+        end = time.monotonic() + 120.0
+        while not (tries.exists() and len(tries.read_text()) > 2) and time.monotonic() < end:
+            time.sleep(0.05)
+    (record,) = caplog.records
+    assert record.getMessage() == (
+        "the report of the running sweep could not be drawn (no disk ***); training goes on, and it is tried "
+        "again"
+    )
+
+
 def test_a_short_sweep_is_left_alone(made_up_sweep: Callable[..., SweepStore]) -> None:
     store = made_up_sweep(seeds=1, tasks=["a"], agents=["cpo"], methods=["none"])
     with refreshing(store):

@@ -337,7 +337,10 @@ def test_the_names_of_several_costs_are_recorded(undisturbed: TrialStore, tmp_pa
     )
     store = SweepStore(tmp_path, "sweep").trial(spec)
     assert run_recorded(spec, store, should_stop=stop_after(1)) is TrialStatus.WAITING
-    assert store.provenance()[0]["cost_names"] == ["wear", "noise"]
+    assert run_recorded(spec, store, should_stop=stop_after(1)) is TrialStatus.WAITING
+    assert [attempt["cost_names"] for attempt in store.provenance()] == [["wear", "noise"]] * 2
+    assert [attempt["attempt"] for attempt in store.provenance()] == [1, 2]
+    assert all(attempt["packages"] for attempt in store.provenance())
     assert "cost_names" not in undisturbed.provenance()[0]
 
 

@@ -119,17 +119,41 @@ def test_every_metric_of_every_agent_is_explained() -> None:
             assert f"`{re.sub(r'_0$', '_i', metric)}`" in explained, f"{name}: {metric}"
 
 
-def test_every_column_is_explained() -> None:
-    explained = (REFERENCE / "files.md").read_text()
-    columns = {
-        *trial_files.EPISODE_COLUMNS,
-        *trial_files.UPDATE_COLUMNS,
-        *trial_files.EVALUATION_COLUMNS,
-        *sweep_data.TRIAL_COLUMNS,
-        *sweep_data.PHASE_COLUMNS,
-        *sweep_data.EVENT_COLUMNS,
-    }
-    assert not [name for name in columns if f"`{name}`" not in explained]
+def names_in(rows: str, cell: int = 0) -> list[str]:
+    """Return the names in one cell of each row of a Markdown table, in order."""
+    lines = [line.strip("|").split("|") for line in rows.splitlines() if line.startswith("| `")]
+    return [name for line in lines for name in re.findall(r"`([^`]+)`", line[cell])]
+
+
+@pytest.mark.parametrize(
+    ("file", "columns"),
+    [
+        ("episodes.csv", (*trial_files.EPISODE_COLUMNS, "cost_i", "limit_i")),
+        ("updates.csv", (*trial_files.UPDATE_COLUMNS, "cost_i", "limit_i")),
+        ("evaluation.csv", (*trial_files.EVALUATION_COLUMNS, "cost_i")),
+    ],
+)
+def test_a_files_table_has_its_columns_and_no_others(file: str, columns: tuple[str, ...]) -> None:
+    section = (REFERENCE / "files.md").read_text().partition(f"\n## `{file}`\n")[2].partition("\n## ")[0]
+    assert names_in(section) == list(columns)
+
+
+@pytest.mark.parametrize(
+    ("frame", "columns"),
+    [
+        ("trials", sweep_data.TRIAL_COLUMNS),
+        (
+            "phases",
+            (*sweep_data.PHASE_COLUMNS, *(f"{it}_i{end}" for it, end in sweep_data.PHASE_COST_COLUMNS)),
+        ),
+        ("events", sweep_data.EVENT_COLUMNS),
+    ],
+)
+def test_a_frame_has_the_listed_columns_and_no_others(frame: str, columns: tuple[str, ...]) -> None:
+    (row,) = re.findall(rf"^\| `{frame}` \| .*$", (REFERENCE / "files.md").read_text(), re.MULTILINE)
+    listed = names_in(row, cell=2)
+    of_costs = ["train_limit_i", "deploy_limit_i", "start_limit_i"]  # before the optimum, one for each cost
+    assert [name for name in listed if name not in of_costs] == list(columns)
 
 
 def test_every_event_is_explained() -> None:

@@ -68,8 +68,10 @@ ADAPTERS = {
 LAYERS = (
     (
         "background_thread",
+        "capacity",
         "counting",
         "errors",
+        "executor_kind",
         "exit_codes",
         "located_yaml",
         "number_texts",

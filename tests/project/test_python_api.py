@@ -35,6 +35,7 @@ GRID = {
     "seeds": 1,
     "run": {**RUN, "evaluation_episodes": 2},
 }
+QUIETLY: Any = {"executor": "inline", "mlflow": False, "figures": False, "progress": False}
 # the curriculum of two updates lands hard
 pytestmark = pytest.mark.filterwarnings("ignore:hard landing:UserWarning")
 OWN_TASK = """\
@@ -110,7 +111,7 @@ def test_training_returns_frames_and_a_policy_and_keeps_nothing(folder: Path) ->
 
 def test_training_equals_the_sweeps_trial(folder: Path) -> None:
     one = train(method="linear", folder="one")
-    sweep = recrl.launch(GRID, executor="inline", mlflow=False, figures=False, progress=False)
+    sweep = recrl.launch(GRID, **QUIETLY)
     assert one.folder is not None
     (other,) = SweepStore(folder / "runs", "small").find("two-state ppo-lag linear")
     for name in ("evaluation.csv", "episodes.csv"):
@@ -190,6 +191,24 @@ def test_a_trial_that_fails_raises_with_its_traceback(folder: Path, monkeypatch:
     with pytest.raises(recrl.RecrlError, match="ZeroDivisionError") as error:
         train(task="broken_room:make")
     assert "Traceback" in error.value.__notes__[0]
+
+
+def test_a_failed_trial_runs_again_after_its_cause_is_mended(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``train`` always tries again, ``launch`` if asked."""
+
+    def failing(trial: Trial) -> None:
+        raise ZeroDivisionError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trial, "advance", failing)
+        with pytest.raises(recrl.RecrlError, match="ZeroDivisionError"):
+            train(folder=folder / "kept")
+        recrl.launch(GRID, **QUIETLY)
+    assert len(train(folder=folder / "kept").updates) == 4
+    assert set(recrl.launch(GRID, **QUIETLY).trials["status"]) == {"failed"}
+    assert set(recrl.launch(GRID, retry_failed=True, **QUIETLY).trials["status"]) == {"complete"}
 
 
 @pytest.mark.parametrize("progress", [False, True])
@@ -488,7 +507,7 @@ def test_a_place_that_cannot_be_used_is_a_sentence(folder: Path, place: str, sen
         train(folder=place)
     assert str(error.value).endswith(sentence)
     with pytest.raises(recrl.RecrlError, match=r"; saved results are kept$"):
-        recrl.launch(GRID, root=place, executor="inline", mlflow=False, figures=False, progress=False)
+        recrl.launch(GRID, root=place, **QUIETLY)
 
 
 def test_only_an_address_takes_the_name_of_a_sweep(finished_sweep: SweepStore) -> None:
