@@ -56,7 +56,8 @@ class GymnasiumOptions(Options):
                 import_module(module)
             gymnasium.spec(registered)
         except (gymnasium.error.Error, ImportError, ValueError) as error:
-            raise ValueError(str(error)) from error
+            hint = "" if separator else f"; if a module registers it, name it as in my_module:{identifier}"
+            raise ValueError(f"{str(error).rstrip('.?')}{hint}") from error
         except SystemExit as error:
             raise ValueError(f"importing {module} ends the process (exit code {error.code})") from error
         return identifier
@@ -89,13 +90,17 @@ def _check_keywords_of_id(options: GymnasiumOptions) -> None:
 
 
 def keywords_of(factory: Callable[..., Environment]) -> str:
-    """Return the names of the keyword arguments of a user's callable, as text."""
+    """Return the keyword arguments of a user's callable and their defaults, as text."""
     try:
         parameters = inspect.signature(factory).parameters.values()
     except (TypeError, ValueError):  # builtins have none
         return "unknown"
-    named = [it.name for it in parameters if it.kind not in (it.VAR_POSITIONAL, it.POSITIONAL_ONLY)]
-    return ", ".join(named) or "none"
+    named = [it for it in parameters if it.kind not in (it.VAR_POSITIONAL, it.POSITIONAL_ONLY)]
+    settings = [it for it in named if it.name != "render_mode"]  # recrl gives it, for films
+    return (
+        ", ".join(it.name if it.default is it.empty else f"{it.name}={it.default!r}" for it in settings)
+        or "none"
+    )
 
 
 def make_from_callable(

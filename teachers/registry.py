@@ -9,6 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from recrl.environments.cmdp import CurriculumStep
 from recrl.environments.options import require_model
 from recrl.environments.plugins import WrongKindError, resolve
 from recrl.teachers.algorithm_2 import Algorithm2Teacher
@@ -59,6 +60,31 @@ class TeacherKind:
 
     def __post_init__(self) -> None:
         require_model(self.config)
+
+    def require_declared(
+        self, step: CurriculumStep, before: CurriculumStep | None, *, curriculum: str
+    ) -> None:
+        """Check that a step has nothing that must be declared here and is not.
+
+        Args:
+            step: the step.
+            before: the one before it; None at the start.
+            curriculum: its label, for errors.
+
+        Raises:
+            TypeError: it has an entropy coefficient, or start limits that were measured.
+        """
+        if step.entropy_coefficient is not None and not self.rewards_entropy:
+            raise TypeError(
+                f"curriculum {curriculum}: a step has an entropy_coefficient, so its TeacherKind must have "
+                "rewards_entropy=True"
+            )
+        is_measured = before is not None and step.start_limits not in (None, before.start_limits)
+        if is_measured and not self.measures_start:
+            raise TypeError(
+                f"curriculum {curriculum}: start_limits came after the first step, so its TeacherKind must "
+                "have measures_start=True"
+            )
 
 
 def _decay(summary: str, decay: Decay) -> TeacherKind:

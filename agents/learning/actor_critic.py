@@ -97,6 +97,8 @@ class ActorCritic(NetworkPolicy):
         }
         if isinstance(self._constraint, MeanCost):
             self._parts["constraint"] = self._constraint
+        if not isinstance(getattr(rule, "parts", None), Mapping):
+            raise TypeError("a rule needs an attribute parts: a dict of what is saved, {} for nothing")
         reserved = {"policy", "critics", "generator", "constraint", *self._parts}
         if taken := sorted(rule.parts.keys() & reserved):
             raise ValueError(f"a rule's parts need other names than the agent's own, got {', '.join(taken)}")
@@ -291,7 +293,15 @@ def fresh_agent(
         config: the agent's settings.
         seed: of the initial parameters and of the order of minibatches.
         make_rule: the agent's rule for a policy.
+
+    Raises:
+        TypeError: the settings are not those of an actor-critic, or the rule has no ``parts``.
     """
+    if not isinstance(config, ActorCriticConfig):
+        raise TypeError(
+            "the options of an agent of fresh_agent must derive from those in recrl.agents.shared_options, "
+            f"such as ActorCriticConfig, got {type(config).__name__}"
+        )
     encoder = Encoder(
         observation_size(cmdp.observation_space),
         cmdp.components,

@@ -13,7 +13,7 @@ from recrl.orchestrator.counting import counted
 from recrl.orchestrator.errors import TrackingError
 from recrl.orchestrator.exit_codes import ExitCode
 from recrl.orchestrator.files.sweep_store import SweepStore
-from recrl.orchestrator.tracking.client import one_line, tracking_uri
+from recrl.orchestrator.tracking.client import is_server, one_line, tracking_uri
 from recrl.orchestrator.tracking.export_file import write_in_own_process
 from recrl.orchestrator.tracking.final_outcomes import FinalOutcomes
 from recrl.orchestrator.tracking.mlflow_sync import sync, without_export
@@ -25,7 +25,10 @@ def run_ui(request: UIRequest, console: Console) -> ExitCode:
     store = open_store(request)
     for number in (signal.SIGINT, signal.SIGTERM):  # open_ui, too, ends the server before it raises
         signal.signal(number, signal.default_int_handler)
-    ui = open_ui(store, tracking_uri(store, request.tracking_uri), port=request.port)
+    uri = tracking_uri(store, request.tracking_uri)
+    if not is_server(uri):
+        say(console, "Starting MLflow's server ...")  # up to a minute on a busy machine
+    ui = open_ui(store, uri, port=request.port)
     say(console, f"Open {ui.url}")
     if ui.process is not None:
         say(console, "Ctrl-C ends it.")

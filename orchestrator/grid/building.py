@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -12,24 +11,24 @@ import numpy as np
 
 from recrl.agents.agent import learns_rewarded_entropy
 from recrl.agents.registry import AGENTS, make_agent
-from recrl.environments.cmdp import CMDPSpec, CostLimits
+from recrl.environments.cmdp import CMDPSpec
 from recrl.environments.gymnasium_adapter import SyncCMDPVectorEnv
 from recrl.environments.registry import TASKS, make_vector
 from recrl.orchestrator.errors import USERS_ERRORS, described, described_with_place
 from recrl.orchestrator.grid.checked_grid import GridSpec
+from recrl.orchestrator.grid.curriculum_questions import ask_through
 from recrl.orchestrator.grid.problem_list import TASK_MARK
 from recrl.orchestrator.located_yaml import Place
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.teachers.registry import TEACHERS, find_teacher, make_teacher
 from recrl.teachers.static import StaticTeacher
-from recrl.teachers.teacher import AnswerCheck, ProgressReport
+from recrl.teachers.teacher import AnswerCheck
 
 logger = logging.getLogger("recrl.sweep")
 
 PLAIN_AGENT = Choice("ppo-lag")
 CHECKED_STEPS = 16  # of a user's environment
 EPISODE_SECONDS = 2.0  # at most, of its first episode
-CHECKED_UPDATES = 200  # at most, of a curriculum of the clock
 NO_CURRICULUM, NO_LIMITS = Choice("none"), Choice("unconstrained")
 
 
@@ -175,9 +174,9 @@ def _curriculums_mistake(spec: TrialSpec, cmdp: CMDPSpec, *, is_rehearsed: bool)
     except USERS_ERRORS as error:
         return f"cannot be started on {TASK_MARK}: {described_with_place(error)}"
     try:
-        _check_decay(spec, cmdp)
+        ask_through(spec, cmdp)
     except USERS_ERRORS as error:
-        return f"fails later in training on {TASK_MARK}: {described_with_place(error)}"
+        return f"fails in training on {TASK_MARK}: {described_with_place(error)}"
     mistake = _mistake(replace(spec, agent=PLAIN_AGENT)) if is_rehearsed else ""
     return f"on {TASK_MARK} {mistake}" if mistake else ""
 
@@ -212,25 +211,6 @@ def _check_start(spec: TrialSpec, cmdp: CMDPSpec) -> None:
             "it will measure the infinite train_limits, so its TeacherKind must have measures_start=True; or "
             "give StaticTeacher start_fraction=0"
         )
-
-
-def _check_decay(spec: TrialSpec, cmdp: CMDPSpec) -> None:
-    """Check the limits of a curriculum of the clock alone, from the first update of training to the last.
-
-    An infinite d_t, which is yet to be measured, is replaced by one above d_d.
-    """
-    pairs = zip(spec.train_limits, spec.deploy_limits, strict=True)
-    train_limits = CostLimits(tuple(train if math.isfinite(train) else 2.0 * d + 1.0 for train, d in pairs))
-    teacher = make_teacher(replace(spec.teacher, train_limits=train_limits))
-    if not isinstance(teacher, StaticTeacher):
-        return
-    check = AnswerCheck(spec.method.label, cmdp.cost_names, train_limits, spec.deploy_limits)
-    step, state = teacher.start()
-    updates = spec.train_updates
-    chosen = np.linspace(1, updates, min(updates, CHECKED_UPDATES), dtype=int).tolist()
-    for number, update in enumerate(chosen, 1):  # reports have consecutive numbers
-        answer = teacher.step(state, ProgressReport(number, update * spec.steps_per_update, ()))
-        step, state = check.checked(answer, before=step.limits, update=update)
 
 
 def _is_own_task(task: Choice) -> bool:

@@ -26,7 +26,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from recrl.agents.registry import agent_config
+from recrl.agents.registry import find_agent
 from recrl.environments.cmdp import CMDPSpec, CostLimits
 from recrl.environments.plugins import (
     UnknownNameError,
@@ -35,7 +35,7 @@ from recrl.environments.plugins import (
     nearest,
     trusted_attribute,
 )
-from recrl.environments.registry import task_options
+from recrl.environments.registry import options_model
 from recrl.orchestrator.errors import USERS_ERRORS, GridError, UntrustedGridError, described, missing
 from recrl.orchestrator.grid.building import BuildError, build_own, cmdp_of
 from recrl.orchestrator.grid.checked_grid import GridSpec, TaskCell
@@ -53,7 +53,7 @@ from recrl.orchestrator.validation_sentences import (
     require_json,
     sentences,
 )
-from recrl.teachers.registry import teacher_config
+from recrl.teachers.registry import find_teacher
 
 MAX_TRIALS = 100_000
 ROLLOUT_STEPS = 64  # by default: short rollouts of many environments give many updates
@@ -62,7 +62,7 @@ DEFAULT_LIMITS: Mapping[str, tuple[float, ...] | None] = {"train_limits": (math.
 
 Model = TypeVar("Model", bound=BaseModel)
 # Function of a registry that validates the options of a name and adds defaults.
-OptionsOf = Callable[[str, Mapping[str, Any]], BaseModel]
+ModelOf = Callable[[str], type[BaseModel]]  # of the options of what a name means
 
 
 def read_grid(path: Path, *, build: bool = False) -> GridSpec:
@@ -160,8 +160,8 @@ class _Check:
             return None
         file = self._validated(GridFile, self._raw)
         tasks = self._tasks()
-        agents = self._choices("agents", Entry, agent_config)
-        methods = self._choices("methods", Entry, teacher_config)
+        agents = self._choices("agents", Entry, lambda name: find_agent(name).config)
+        methods = self._choices("methods", Entry, lambda name: find_teacher(name).config)
         if file is None or self.problems or self.uncalled:
             return None
         grid = GridSpec(
@@ -230,7 +230,7 @@ class _Check:
         """Return the tasks with correct limits and rollouts."""
         run = _valid(Run, self._raw.get("run"))
         cells = []
-        for index, task in self._choices("tasks", TaskEntry, task_options).items():
+        for index, task in self._choices("tasks", TaskEntry, options_model).items():
             try:
                 cmdp = cmdp_of(task)
             except BuildError as error:
@@ -243,7 +243,7 @@ class _Check:
                 cells.append(TaskCell(task, *limits, rollout_steps, cmdp.horizon))
         return cells
 
-    def _choices(self, section: str, model: type[Entry], options_of: OptionsOf) -> dict[int, Choice]:
+    def _choices(self, section: str, model: type[Entry], model_of: ModelOf) -> dict[int, Choice]:
         """Return the correct entries of a section, by their index."""
         choices: dict[int, Choice] = {}
         for index, value in enumerate(_items(self._raw.get(section))):
@@ -251,9 +251,9 @@ class _Check:
             if entry is None:  # the schema check has reported why; its name may be wrong as well
                 named = _valid(Entry, _named(value))
                 if named is not None:
-                    self._options((section, index), named, options_of)
+                    self._options((section, index), named, model_of)
                 continue
-            options = self._options((section, index), entry, options_of)
+            options = self._options((section, index), entry, model_of)
             if options is None:
                 continue
             choice = Choice(entry.name, options, entry.label)
@@ -261,18 +261,20 @@ class _Check:
             choices[index] = choice
         return choices
 
-    def _options(self, place: Place, entry: Entry, options_of: OptionsOf) -> dict[str, Any] | None:
+    def _options(self, place: Place, entry: Entry, model_of: ModelOf) -> dict[str, Any] | None:
         """Return the entry's options with defaults, as JSON values."""
         name_place = (*place, "name") if (*place, "name") in self._document.lines else place
+        kind: type[BaseModel] | None = None
         try:
-            model = options_of(entry.name, entry.options)
+            kind = model_of(entry.name)
+            model = kind.model_validate(dict(entry.options))
             require_json(entry.options)  # of an untyped option, model_dump writes an infinite number as null
             options = model.model_dump(mode="json")
             require_json(options)
-            if reason := _not_read_back(entry.name, model, options_of):
+            if reason := _not_read_back(model):
                 raise TypeError(f"its model of options must read back what its model_dump returns ({reason})")
         except ValidationError as error:
-            for inner, sentence in sentences(error, _model_of(entry.name, options_of)):
+            for inner, sentence in sentences(error, kind):
                 self.problems.add((*place, "options", *inner), sentence)
         except (UnknownNameError, WrongKindError) as error:
             self.problems.add(name_place, str(error))
@@ -395,25 +397,17 @@ def _named(value: Any) -> Any:
     )
 
 
-def _not_read_back(name: str, model: BaseModel, options_of: OptionsOf) -> str:
+def _not_read_back(model: BaseModel) -> str:
     """Return why options with their defaults, as a trial stores them, are read as others; empty if not."""
     stored = model.model_dump(mode="json")
     try:
-        again = options_of(name, stored)
+        again = type(model).model_validate(stored)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
     if again.model_dump(mode="json") == stored or again == model:  # sets have no order in a dump
         return ""
     return "it reads other values; a field with an alias needs populate_by_name=True"
-
-
-def _model_of(name: str, options_of: OptionsOf) -> type[BaseModel] | None:
-    """Return the class of the options of ``name``, if it can be built without arguments."""
-    try:
-        return type(options_of(name, {}))
-    except (ValidationError, *USERS_ERRORS):
-        return None
 
 
 def _items(value: Any) -> list[Any]:

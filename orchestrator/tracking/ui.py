@@ -20,7 +20,7 @@ from recrl.orchestrator.tracking.positions import sync_folder
 # Without the job runner of MLflow's language-model features a server takes 0.5 GB of memory and not 2.5.
 SERVER_SETTINGS = ("DO_NOT_TRACK", "MLFLOW_DISABLE_TELEMETRY", "MLFLOW_SERVER_ENABLE_JOB_EXECUTION")
 
-START_SECONDS = 120.0  # until the server must answer
+START_SECONDS = 300.0  # until the server must answer
 
 
 def ui_command(store: SweepStore, uri: str, *, port: int = 5000) -> list[str]:

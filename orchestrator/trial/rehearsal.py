@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from recrl.agents.agent import final_policy
-from recrl.agents.registry import make_agent
+from recrl.agents.registry import agent_config, make_agent
 from recrl.agents.spaces import environment_actions
 from recrl.orchestrator.errors import USERS_ERRORS, described
 from recrl.orchestrator.files.checkpoint_format import encode
 from recrl.orchestrator.files.scratch import scratch_folder
 from recrl.orchestrator.files.trial_store import TrialStore
-from recrl.orchestrator.spec import TrialSpec
+from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.orchestrator.trial.agent_answers import checked_noise
 from recrl.orchestrator.trial.torch_settings import torch_settings
 from recrl.orchestrator.trial.trial import Trial, TrialSeeds, open_environments
@@ -27,6 +27,7 @@ from recrl.teachers.teacher import TeacherSpec
 
 UPDATES_BEFORE, UPDATES_AFTER = 2, 3  # the restart; the last update is in the deployment phase
 MOST_ENVIRONMENTS, MOST_STEPS = 2, 16
+MINIBATCH = 2  # so small that an update has several, as in a trial
 SAVED = "what changes must be in the saved state"
 DETERMINED = f"{SAVED}; reset(seed=...) and the actions must determine an episode"
 NOISE = 0.1
@@ -45,7 +46,7 @@ def rehearse(spec: TrialSpec) -> None:
     """Run the beginning of a small copy of a trial twice: without interruption, and with a restart.
 
     Args:
-        spec: of the trial; environments, steps and updates are fewer.
+        spec: of the trial; environments, steps and updates are fewer, and minibatches smaller.
 
     Raises:
         RestartError: the second one fails or differs.
@@ -55,6 +56,7 @@ def rehearse(spec: TrialSpec) -> None:
     num_envs, steps = min(spec.num_envs, MOST_ENVIRONMENTS), min(spec.rollout_steps, MOST_STEPS)
     small = replace(
         spec,
+        agent=_with_small_minibatches(spec.agent),
         num_envs=num_envs,
         rollout_steps=steps,
         train_steps=(UPDATES_BEFORE + UPDATES_AFTER - 1) * num_envs * steps,
@@ -69,6 +71,13 @@ def rehearse(spec: TrialSpec) -> None:
             raise RestartError(f"{described(error)}; {SAVED}") from error
         _compare(whole, resumed)
         _act(whole)
+
+
+def _with_small_minibatches(agent: Choice) -> Choice:
+    """Return an agent whose updates have minibatches also for few samples, if it has minibatches."""
+    if not getattr(agent_config(agent.name, agent.options), "minibatch_size", None):
+        return agent
+    return replace(agent, options={**agent.options, "minibatch_size": MINIBATCH})
 
 
 def _compare(whole: TrialStore, resumed: TrialStore) -> None:

@@ -33,7 +33,7 @@ from recrl.agents.agent import (
 from recrl.agents.collection import Collector, FinishedEpisode, episode_costs
 from recrl.agents.evaluation import PolicyKind, evaluate
 from recrl.agents.registry import make_agent
-from recrl.environments.cmdp import CostLimits, CurriculumStep, EpisodeStats, Floats, Phase
+from recrl.environments.cmdp import CurriculumStep, EpisodeStats, Floats, Phase
 from recrl.environments.finite.finite_cmdp import FiniteVectorEnv
 from recrl.environments.registry import make_vector
 from recrl.environments.vector import CMDPVectorEnv
@@ -163,7 +163,7 @@ class Trial:
         }
         self._writer.append_update({**row, **checked_metrics(self.spec.agent.label, metrics, row)})
         if self.update % max(1, self.spec.num_updates // LOGGED_UPDATES) == 0 or self.learned:
-            logger.info("%s", self._log_line(row))
+            logger.info("%s", self._log_line(row), extra={"progress": self.update / self.spec.num_updates})
         self._next_step(episodes, rollout.observations)
 
     def close(self) -> None:
@@ -234,13 +234,8 @@ class Trial:
         before = self._step
         report = ProgressReport(update=self.update, env_steps=self.env_steps, episodes=episodes)
         answer = self._teacher.step(self._teacher_state, report)
-        self._step, self._teacher_state = self._checked(answer, before=before.limits)
+        self._step, self._teacher_state = self._checked(answer, before=before)
         if self._step.start_limits is not None and self._step.start_limits != before.start_limits:
-            if not self._curriculum.measures_start:
-                raise TypeError(
-                    f"curriculum {self.spec.method.label}: start_limits came after the first step, so its "
-                    "TeacherKind must have measures_start=True"
-                )
             limits = self._step.start_limits.to_json()
             self._event("start limits measured", limits=limits)
             if self.spec.is_no_curriculum(limits):
@@ -250,16 +245,14 @@ class Trial:
             done = checked_noise(self.spec.agent.label, self._agent.add_noise(self._step.policy_noise, flat))
             self._event(POLICY_NOISE, policy_noise=self._step.policy_noise, **done)
 
-    def _checked(self, answer: object, *, before: CostLimits | None) -> tuple[CurriculumStep, TeacherState]:
-        """Check the curriculum's answer; ``before`` has the limits before it, None at the start."""
+    def _checked(
+        self, answer: object, *, before: CurriculumStep | None
+    ) -> tuple[CurriculumStep, TeacherState]:
+        """Check the curriculum's answer; ``before`` is the step before it, None at the start."""
         label = self.spec.method.label
         check = AnswerCheck(label, self._cmdp.cost_names, self.spec.train_limits, self.spec.deploy_limits)
-        step, state = check.checked(answer, before=before, update=self.update)
-        if step.entropy_coefficient is not None and not self._curriculum.rewards_entropy:
-            raise TypeError(
-                f"curriculum {label}: a step has an entropy_coefficient, so its TeacherKind must have "
-                "rewards_entropy=True"
-            )
+        step, state = check.checked(answer, before=before.limits if before else None, update=self.update)
+        self._curriculum.require_declared(step, before, curriculum=label)
         if step.rewards_entropy and not learns_rewarded_entropy(self._agent):
             raise TypeError(
                 f"method {self.spec.method.name} rewards entropy, which agent {self.spec.agent.name} does "

@@ -199,7 +199,8 @@ def train(
     sweep's trial with these settings, byte for byte.
 
     Args:
-        task: its name, or a mapping with ``name`` and ``options``.
+        task: its name, or a mapping with ``name`` and ``options``. The name of your own code is its import
+            path, ``my_module:ENTRY``.
         agent: likewise.
         method: the curriculum, likewise; ``none`` trains under the deployment limits from the start.
         total_steps: environment steps of both phases, over all environments.
@@ -339,7 +340,10 @@ def _checked(grid: Grid, *, build: bool = False) -> GridSpec:
         data = dump(grid)
     except TypeError as error:
         raise GridError(
-            [f"{SOURCE}: must hold plain values only, and code by its import path, my_module:MyTask: {error}"]
+            [
+                f"{SOURCE}: must hold plain values only ({error}); give code by its import path, "
+                "my_module:ENTRY"
+            ]
         ) from error
     try:
         return parse_grid(data, source=SOURCE, build=build)
@@ -357,19 +361,19 @@ class _LineInPlace(logging.Handler):
 
 
 class _PlainLines(logging.Handler):
-    """Handler that prints a line of a trial's log for each tenth of its updates, and after each minute."""
+    """Handler that prints an update's line in a trial's log for each tenth of them, and after each minute."""
 
     def __init__(self) -> None:
         super().__init__()
         self._tenth, self._printed = -1, time.monotonic()
 
     def emit(self, record: logging.LogRecord) -> None:
-        message, now = record.getMessage(), time.monotonic()
-        if not (update := re.match(r"update (\d+) of (\d+)", message)):
+        progress, now = getattr(record, "progress", None), time.monotonic()
+        if progress is None:  # not the line of an update
             return
-        tenth = 10 * int(update[1]) // int(update[2])
+        tenth = int(10 * progress + 1e-9)
         if tenth > self._tenth or now > self._printed + LINE_SECONDS:
-            print(message, file=sys.stderr, flush=True)
+            print(record.getMessage(), file=sys.stderr, flush=True)
             self._tenth, self._printed = tenth, now
 
 

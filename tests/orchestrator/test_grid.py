@@ -101,6 +101,18 @@ def test_ten_mistakes_give_ten_located_sentences() -> None:
             "[{name: ppo-lag, options: {num_envs: 8}}]",
             "3: agents.0.options.num_envs: unknown key; it belongs in the section 'run' of the grid",
         ),
+        (
+            "{name: two-state,",
+            "{name: gymnasium, options: {id: CartPole-v1, limit: 3},",
+            "2: tasks.0.options.limit: unknown key (known: id, keywords, cost_names, costless); an argument "
+            "of the environment goes below keywords",
+        ),
+        (
+            "{name: two-state,",
+            "{name: gymnasium, options: {id: lab/Drift-v0},",
+            "2: tasks.0.options.id: Namespace lab not found. Have you installed the proper package for lab; "
+            "if a module registers it, name it as in my_module:lab/Drift-v0",
+        ),
         ("{total_steps", "{total_step", "6: run.total_step: unknown key; did you mean 'total_steps'?"),
         ("{name: two", "{nam: two", "2: tasks.0.nam: unknown key; did you mean 'name'?"),
         (

@@ -16,7 +16,10 @@ import numpy as np
 from pydantic import BaseModel, Field, computed_field, model_validator
 
 from recrl.agents.algorithms.ppo import make_ppo
+from recrl.agents.learning.actor_critic import fresh_agent
+from recrl.agents.learning.gradient_ascent import FirstOrderRule
 from recrl.agents.registry import AGENTS, AgentEntry
+from recrl.agents.shared_options import AscentConfig
 from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.teachers.registry import TeacherKind
 from recrl.teachers.static import StaticTeacher
@@ -233,6 +236,31 @@ NO_ENTROPY = entry(NoEntropy)
 FALLING = entry(Falling)
 
 
+class WholeBatch(FirstOrderRule):
+    """Takes the advantages of the whole batch for each of its parts."""
+
+    def improve(self, policy, experience, generator):
+        advantages = experience.batch.per_pair(experience.advantages[:, 0])
+        return self.ascend(policy, experience, lambda part: lambda _, ratios: ratios @ advantages, generator)
+
+
+class ByPart(WholeBatch):
+    def improve(self, policy, experience, generator):
+        def objective(part):
+            advantages = part.batch.per_pair(experience.advantages[:, 0])
+            return lambda _, ratios: ratios @ advantages
+
+        return self.ascend(policy, experience, objective, generator)
+
+
+def ascending(rule):
+    make = lambda cmdp, options, seed: fresh_agent(cmdp, options, seed, lambda it: rule(options, it))
+    return AgentEntry(rule.__name__, AscentConfig, make)
+
+
+WHOLE_BATCH, BY_PART = map(ascending, (WholeBatch, ByPart))
+
+
 class Staircase:
     """Keeps its step in itself."""
 
@@ -245,6 +273,43 @@ class Staircase:
     def step(self, state, report):
         self.at += 1
         return CurriculumStep(CostLimits((5.0 - 0.1 * self.at,))), {"update": report.update}
+
+
+class Remembering(Staircase):
+    """Answers a report again, but not after a restart."""
+
+    def step(self, state, report):
+        if report.update > state["update"]:
+            self.at += 1
+        return CurriculumStep(CostLimits((5.0 - 0.01 * self.at,))), {"update": report.update}
+
+
+class Changing(Staircase):
+    def step(self, state, report):
+        state["update"] = report.update
+        return CurriculumStep(CostLimits((5.0,))), state
+
+
+class Misspelt(Staircase):
+    """Wrong only where an episode has ended."""
+
+    def step(self, state, report):
+        costs = [episode.cost for episode in report.episodes]
+        return CurriculumStep(CostLimits((5.0,))), {"update": report.update}
+
+
+class Measuring(Staircase):
+    def step(self, state, report):
+        limits = CostLimits((5.0,))
+        return CurriculumStep(limits, start_limits=limits), {"update": report.update}
+
+
+class LateLow(Staircase):
+    """Wrong only at the end of the training phase."""
+
+    def step(self, state, report):
+        limit = 5.0 if report.env_steps < 0.9 * self.spec.train_steps else 0.5
+        return CurriculumStep(CostLimits((limit,))), {"update": report.update}
 
 
 class TooLow(Staircase):
@@ -292,8 +357,10 @@ def decaying(decay, measures_start=True):
     return TeacherKind(decay.__name__, NoOptions, make, measures_start=measures_start)
 
 
-KINDS = (Staircase, TooLow, NoStep, Long)
-STAIRCASE, TOO_LOW, NO_STEP, LONG = (TeacherKind(kind.__name__, NoOptions, kind) for kind in KINDS)
+KINDS = (Staircase, TooLow, NoStep, Long, Remembering, Changing, Misspelt, Measuring, LateLow)
+STAIRCASE, TOO_LOW, NO_STEP, LONG, REMEMBERING, CHANGING, MISSPELT, MEASURING, LATE = (
+    TeacherKind(kind.__name__, NoOptions, kind) for kind in KINDS
+)
 TOO_LOW_LATER, RISING, STRAIGHT, AS_TEXT = map(decaying, (too_low_later, rising, straight, as_text))
 UNDECLARED = decaying(straight, measures_start=False)
 LOOSE, STRICT, RENAMED, SHORTHAND = (
@@ -347,6 +414,7 @@ run: {{total_steps: {total_steps}}}
 def test_what_works_and_resumes_is_right() -> None:
     assert problems(task="own_rehearsed:Room") == []
     assert problems(agents=["own_rehearsed:REORDERED"], methods=["own_rehearsed:LONG"]) == []
+    assert problems(task="own_rehearsed:Room", agents=["own_rehearsed:BY_PART"]) == []
 
 
 def test_a_task_whose_episodes_do_not_follow_from_their_seed() -> None:
@@ -427,6 +495,14 @@ def test_an_agent(agent: str, sentence: str) -> None:
     assert sentence in problem
 
 
+def test_an_agent_that_is_wrong_only_in_minibatches() -> None:
+    """A rehearsal has few samples, and yet several minibatches."""
+    (problem,) = problems(task="own_rehearsed:Room", agents=["own_rehearsed:WHOLE_BATCH"])
+    assert (
+        "fails in its first updates: RuntimeError: inconsistent tensor size, expected tensor [2]" in problem
+    )
+
+
 def test_an_agent_that_meets_a_curriculum_which_rewards_entropy() -> None:
     (problem,) = problems(agents=["own_rehearsed:NO_ENTROPY"], methods=["none", "cooling"])
     assert problem == (
@@ -439,7 +515,18 @@ def test_an_agent_that_meets_a_curriculum_which_rewards_entropy() -> None:
 @pytest.mark.parametrize(
     ("curriculum", "sentence"),
     [
-        ("STAIRCASE", "does not continue exactly after a restart from a checkpoint: ValueError: curriculum "),
+        ("STAIRCASE", "asked again about the same update, it answers otherwise; answer a report that the "),
+        (
+            "REMEMBERING",
+            "does not continue exactly after a restart from a checkpoint: ValueError: curriculum ",
+        ),
+        ("CHANGING", "step must not change the state that it is given"),
+        ("MISSPELT", "AttributeError: 'EpisodeStats' object has no attribute 'cost'"),
+        (
+            "MEASURING",
+            "start_limits came after the first step, so its TeacherKind must have measures_start=True",
+        ),
+        ("LATE", "the limit of wear is 0.5 after update"),
         ("TOO_LOW", "the limit of wear is 0.5 after update 1, below its deploy_limits of 2"),
         (
             "NO_STEP",
@@ -515,6 +602,6 @@ def test_a_decay_is_checked_up_to_its_end(
 ) -> None:
     of = partial(problems, train_limits=train_limits, total_steps=total_steps)
     (problem,) = of(methods=[f"own_rehearsed:{curriculum}"])
-    assert f"own_rehearsed:{curriculum} fails later in training on two-state: " in problem
+    assert f"own_rehearsed:{curriculum} fails in training on two-state: " in problem
     assert sentence in problem
     assert of(methods=["own_rehearsed:STRAIGHT"]) == []
