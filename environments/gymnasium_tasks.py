@@ -55,9 +55,11 @@ class GymnasiumOptions(Options):
             if separator:
                 import_module(module)
             gymnasium.spec(registered)
+        except (gymnasium.error.NameNotFound, gymnasium.error.NamespaceNotFound) as error:
+            hint = "" if separator else f" If a module of yours registers it, write my_module:{identifier}"
+            raise ValueError(f"{error}{hint}") from error
         except (gymnasium.error.Error, ImportError, ValueError) as error:
-            hint = "" if separator else f"; if a module registers it, name it as in my_module:{identifier}"
-            raise ValueError(f"{str(error).rstrip('.?')}{hint}") from error
+            raise ValueError(str(error)) from error
         except SystemExit as error:
             raise ValueError(f"importing {module} ends the process (exit code {error.code})") from error
         return identifier

@@ -59,7 +59,7 @@ def _quotas(root: Path) -> Iterator[float]:
                     files = mounted / "cpu" / place
                     quota = (files / "cpu.cfs_quota_us").read_text()
                     period = (files / "cpu.cfs_period_us").read_text()
-                if int(quota) > 0:
+                if int(quota) > 0 and int(period) > 0:
                     yield int(quota) / int(period)
 
 
@@ -69,7 +69,7 @@ def _memberships(listed: Path) -> Iterator[tuple[int, PurePosixPath]]:
     Args:
         listed: lines such as ``0::/jobs/7`` (version 2) or ``5:cpu,cpuacct:/jobs/7`` (version 1).
     """
-    with suppress(OSError):
+    with suppress(OSError, ValueError):
         for line in listed.read_text().splitlines():
             _, controllers, group = line.split(":", 2)
             if not controllers:

@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 # Place of a value: keys and list indices from the root, for example ("methods", 1, "options").
-Place = tuple[str | int, ...]
+YamlPath = tuple[str | int, ...]
 
 MAX_BYTES = 1 << 20
 MAX_VALUES = 20_000  # aliases may repeat a part of the file; this bounds the growth
@@ -35,7 +35,7 @@ class Problem:
     """
 
     line: int
-    place: Place
+    place: YamlPath
     sentence: str
 
     def __str__(self) -> str:
@@ -54,10 +54,10 @@ class Document:
     """
 
     value: Any
-    lines: Mapping[Place, int] = field(default_factory=dict)
+    lines: Mapping[YamlPath, int] = field(default_factory=dict)
     problems: tuple[Problem, ...] = ()
 
-    def line(self, place: Place) -> int:
+    def line(self, place: YamlPath) -> int:
         """Return the line of the value at ``place``, or of the nearest value around it."""
         while place and place not in self.lines:
             place = place[:-1]
@@ -188,10 +188,10 @@ class _Reader:
     """Converter of nodes to values that records their lines."""
 
     def __init__(self) -> None:
-        self.lines: dict[Place, int] = {}
+        self.lines: dict[YamlPath, int] = {}
         self.problems: list[Problem] = []
 
-    def value(self, node: yaml.Node, place: Place) -> Any:
+    def value(self, node: yaml.Node, place: YamlPath) -> Any:
         """Return the value of a node at ``place``."""
         line = self.lines.setdefault(place, _line(node))
         if len(place) > MAX_DEPTH:
@@ -207,7 +207,7 @@ class _Reader:
             return [self.value(item, (*place, index)) for index, item in enumerate(node.value)]
         return self._mapping(node, place)
 
-    def _mapping(self, node: yaml.Node, place: Place) -> dict[str, Any]:
+    def _mapping(self, node: yaml.Node, place: YamlPath) -> dict[str, Any]:
         found: dict[str, Any] = {}
         for key_node, value_node in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
@@ -222,7 +222,7 @@ class _Reader:
             found[key] = self.value(value_node, inner)
         return found
 
-    def _scalar(self, node: yaml.ScalarNode, place: Place) -> Any:
+    def _scalar(self, node: yaml.ScalarNode, place: YamlPath) -> Any:
         if node.tag not in _SCALARS:
             self._problem(node, place, f"only plain values are allowed, got the tag {node.tag!r}")
             return node.value
@@ -232,7 +232,7 @@ class _Reader:
             self._problem(node, place, f"cannot be read as a number: {node.value[:40]!r}")
             return node.value
 
-    def _problem(self, node: yaml.Node, place: Place, sentence: str) -> None:
+    def _problem(self, node: yaml.Node, place: YamlPath, sentence: str) -> None:
         self.problems.append(Problem(_line(node), place, sentence))
 
 

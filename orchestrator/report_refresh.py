@@ -65,6 +65,9 @@ def sketch_command(store: SweepStore) -> list[str]:
 def _refresh(store: SweepStore, wait: float, interval: float, over: threading.Event) -> None:
     is_logged = False
     while not over.wait(wait):
+        if not any(trial.record().update for trial in store.trials()):  # nothing to draw yet
+            wait = interval
+            continue
         began = time.monotonic()
         problem = _sketch(store, over)
         if problem and not is_logged:
@@ -99,4 +102,6 @@ def _sketch(store: SweepStore, over: threading.Event) -> str:
             return ""
         said.seek(0)
         lines = said.read().decode(errors="replace").strip().splitlines()
-        return redacted(lines[-1]) if lines else f"exit code {process.returncode}"
+        return (
+            redacted(lines[-1].removeprefix("recrl-sweep: ")) if lines else f"exit code {process.returncode}"
+        )

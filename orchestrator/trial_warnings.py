@@ -182,10 +182,10 @@ def unreadable_code_sentence(errors: Sequence[str]) -> str:
     """
     if not errors:
         return ""
+    first = errors[0] if len(errors) == 1 else f"the first: {errors[0]}"
     return (
         f"the code of {counted(len(errors), 'trial')} was not checked for changes, because the file that "
-        f"names it cannot be read ({errors[0]}); recrl-sweep check lists damaged files, and launch "
-        "--rerun-damaged runs their trials again"
+        f"names it cannot be read ({first})"
     )
 
 

@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from recrl.environments.plugins import nearest_name
-from recrl.orchestrator.located_yaml import Place
+from recrl.orchestrator.located_yaml import YamlPath
 
 _SENTENCES: Mapping[str, str] = {
     "missing": "is required",
@@ -70,7 +70,7 @@ _SECTIONS: Mapping[str, str] = {  # keys that are often put beside options
 }
 
 
-def sentences(error: ValidationError, model: type[BaseModel] | None) -> Iterator[tuple[Place, str]]:
+def sentences(error: ValidationError, model: type[BaseModel] | None) -> Iterator[tuple[YamlPath, str]]:
     """Return all mistakes as (place relative to the validated value, sentence).
 
     A required key that is misspelt is one mistake: the unknown key, not the missing one beside it.
@@ -99,7 +99,7 @@ def sentences(error: ValidationError, model: type[BaseModel] | None) -> Iterator
             yield place, f"{item['msg'][:1].lower()}{item['msg'][1:]}, got {values['given']}"
 
 
-def ignored_keys(model: type[BaseModel], given: Mapping[str, Any]) -> Iterator[tuple[Place, str]]:
+def ignored_keys(model: type[BaseModel], given: Mapping[str, Any]) -> Iterator[tuple[YamlPath, str]]:
     """Yield the keys that validation ignores, with a sentence, unless the model says what to do with them.
 
     Nested models are left out.
@@ -118,7 +118,7 @@ def ignored_keys(model: type[BaseModel], given: Mapping[str, Any]) -> Iterator[t
                 yield item["loc"], _unknown_key(str(item["loc"][0]), list(model.model_fields))
 
 
-def known_keys(model: type[BaseModel] | None, place: Place) -> list[str]:
+def known_keys(model: type[BaseModel] | None, place: YamlPath) -> list[str]:
     """Return the allowed keys at ``place`` inside a value of ``model``; [] if unknown."""
     for part in place:
         if model is None:

@@ -18,7 +18,7 @@ from recrl.orchestrator.errors import USERS_ERRORS, described, described_with_pl
 from recrl.orchestrator.grid.checked_grid import GridSpec
 from recrl.orchestrator.grid.curriculum_questions import ask_through
 from recrl.orchestrator.grid.problem_list import TASK_MARK
-from recrl.orchestrator.located_yaml import Place
+from recrl.orchestrator.located_yaml import YamlPath
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.teachers.registry import TEACHERS, find_teacher, make_teacher
 from recrl.teachers.static import StaticTeacher
@@ -99,7 +99,7 @@ def _ends_in_time(envs: SyncCMDPVectorEnv) -> bool:
     return False
 
 
-def build_own(grid: GridSpec, cmdps: Mapping[str, CMDPSpec]) -> Iterator[tuple[Place, str, str]]:
+def build_own(grid: GridSpec, cmdps: Mapping[str, CMDPSpec]) -> Iterator[tuple[YamlPath, str, str]]:
     """Build the user's own agents, networks and curricula on each task that they meet, and rehearse them.
 
     The user's own tasks are rehearsed with ``ppo-lag`` without a curriculum, agents without a curriculum

@@ -42,7 +42,7 @@ from recrl.orchestrator.grid.checked_grid import GridSpec, TaskCell
 from recrl.orchestrator.grid.curriculum_checks import unsuitable
 from recrl.orchestrator.grid.file_models import Entry, GridFile, Limits, Run, SweepName, TaskEntry
 from recrl.orchestrator.grid.problem_list import TASK_MARK, ProblemList
-from recrl.orchestrator.located_yaml import Place, Problem, parse
+from recrl.orchestrator.located_yaml import Problem, YamlPath, parse
 from recrl.orchestrator.spec import Choice, TrialSpec
 from recrl.orchestrator.untrusted import as_seen
 from recrl.orchestrator.validation_sentences import (
@@ -61,7 +61,6 @@ ROLLOUT_STEPS = 64  # by default: short rollouts of many environments give many 
 DEFAULT_LIMITS: Mapping[str, tuple[float, ...] | None] = {"train_limits": (math.inf,), "deploy_limits": None}
 
 Model = TypeVar("Model", bound=BaseModel)
-# Function of a registry that validates the options of a name and adds defaults.
 ModelOf = Callable[[str], type[BaseModel]]  # of the options of what a name means
 
 
@@ -116,7 +115,7 @@ def read_name(path: Path) -> str:
         raise GridError([f"{path}:{problem}" for problem in problems])
     if "name" not in value:
         misspelt = next((key for key in value if misspells(key, "name", GridFile)), None)
-        place: Place = ("name",) if misspelt is None else (misspelt,)
+        place: YamlPath = ("name",) if misspelt is None else (misspelt,)
         sentence = "is required" if misspelt is None else "unknown key; did you mean 'name'?"
         raise GridError([f"{path}:{Problem(document.line(place), place, sentence)}"])
     try:
@@ -216,7 +215,7 @@ class _Check:
 
     def _check_curricula(self, grid: GridSpec) -> None:
         """Check that the curriculum of each trial suits its agent and limits; one sentence per entry."""
-        found: dict[Place, str] = {}
+        found: dict[YamlPath, str] = {}
         for trial in grid.trials():
             for section, sentence in unsuitable(trial, self.cmdps[trial.task.label]):
                 entries, entry = (
@@ -261,7 +260,7 @@ class _Check:
             choices[index] = choice
         return choices
 
-    def _options(self, place: Place, entry: Entry, model_of: ModelOf) -> dict[str, Any] | None:
+    def _options(self, place: YamlPath, entry: Entry, model_of: ModelOf) -> dict[str, Any] | None:
         """Return the entry's options with defaults, as JSON values."""
         name_place = (*place, "name") if (*place, "name") in self._document.lines else place
         kind: type[BaseModel] | None = None
@@ -291,7 +290,7 @@ class _Check:
             return options
         return None
 
-    def _check_network(self, place: Place, options: Mapping[str, Any]) -> None:
+    def _check_network(self, place: YamlPath, options: Mapping[str, Any]) -> None:
         """Check that a user's network can be imported, if import paths are followed."""
         path = options.get("network")
         if place[0] != "agents" or not isinstance(path, str):
@@ -305,7 +304,7 @@ class _Check:
         except USERS_ERRORS as error:
             self.problems.add(place, f"{path!r} cannot be imported: {described(error)}")
 
-    def _check_differs(self, place: Place, choice: Choice, earlier: Mapping[int, Choice]) -> None:
+    def _check_differs(self, place: YamlPath, choice: Choice, earlier: Mapping[int, Choice]) -> None:
         """Check that no earlier entry has the same label, or is the same under another label."""
         for index, other in earlier.items():
             if as_seen(other.label) == as_seen(choice.label):
@@ -332,9 +331,9 @@ class _Check:
             return None
         return train_limits, deploy_limits
 
-    def _limits(self, index: int, key: str, label: str, cmdp: CMDPSpec) -> tuple[CostLimits | None, Place]:
+    def _limits(self, index: int, key: str, label: str, cmdp: CMDPSpec) -> tuple[CostLimits | None, YamlPath]:
         """Return one kind of a task's limits, its own or the grid's, and their place in the file."""
-        place: Place = ("tasks", index, key)
+        place: YamlPath = ("tasks", index, key)
         raw = self._raw["tasks"][index]
         values = getattr(_valid(TaskEntry, raw), key)
         if values is None:

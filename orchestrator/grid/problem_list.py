@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from recrl.orchestrator.located_yaml import Document, Place, Problem
+from recrl.orchestrator.located_yaml import Document, Problem, YamlPath
 
 TASK_MARK = "\0"  # stands for a task in a sentence, after "on" or "of"
 
@@ -20,17 +20,17 @@ class ProblemList:
         """
         self._document = document
         self._problems = list(document.problems)
-        self._of_tasks: dict[tuple[Place, str], list[str]] = {}  # tasks with the same mistake
+        self._of_tasks: dict[tuple[YamlPath, str], list[str]] = {}  # tasks with the same mistake
 
     def __len__(self) -> int:
         """Return the number of mistakes."""
         return len(self._problems)
 
-    def add(self, place: Place, sentence: str) -> None:
+    def add(self, place: YamlPath, sentence: str) -> None:
         """Add a mistake, with the line of its place."""
         self._problems.append(self._problem(place, sentence))
 
-    def add_of_task(self, place: Place, sentence: str, task: str) -> None:
+    def add_of_task(self, place: YamlPath, sentence: str, task: str) -> None:
         """Add a mistake on a task; the same mistake on further tasks stays one, which names them.
 
         Args:
@@ -54,7 +54,7 @@ class ProblemList:
         ordered = sorted(unique, key=lambda problem: (problem.line, str(problem.place)))
         return [f"{source}:{problem}" for problem in ordered]
 
-    def _problem(self, place: Place, sentence: str) -> Problem:
+    def _problem(self, place: YamlPath, sentence: str) -> Problem:
         return Problem(self._document.line(place), place, sentence)
 
 

@@ -8,7 +8,7 @@ import tokenize
 import warnings
 from collections.abc import Iterator
 
-Place = tuple[int, int]  # a line, from 1, and a byte of it, from 0
+Position = tuple[int, int]  # a line, from 1, and a byte of it, from 0
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
@@ -52,7 +52,7 @@ def _long_strings(nodes: list[ast.AST]) -> Iterator[tuple[int, int]]:
             yield node.lineno, node.end_lineno or node.lineno
 
 
-def _docstrings(nodes: list[ast.AST]) -> Iterator[tuple[Place, Place]]:
+def _docstrings(nodes: list[ast.AST]) -> Iterator[tuple[Position, Position]]:
     """Yield where each docstring begins and ends."""
     for node in nodes:
         if isinstance(node, DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:

@@ -39,7 +39,7 @@ def require_known_ray() -> None:
     Raises:
         ClusterError: a name is missing.
     """
-    missing = [name for name in NAMES if not hasattr(*_place(name))]
+    missing = [name for name in NAMES if not hasattr(*_owner_of(name))]
     if missing:
         raise ClusterError(
             f"Ray {ray.__version__} has no ray._private.{missing[0]}, which recrl uses; install a version "
@@ -51,7 +51,7 @@ def require_known_ray() -> None:
 
 def quiet_driver() -> None:
     """Keep Ray from printing a paragraph about every dead process."""
-    setattr(*_place("worker._worker_logs_enabled"), False)
+    setattr(*_owner_of("worker._worker_logs_enabled"), False)
 
 
 @contextmanager
@@ -60,7 +60,7 @@ def own_sessions() -> Iterator[None]:
 
     They still end with this process, because Ray requests that from the kernel.
     """
-    popen = getattr(*_place("services.ConsolePopen"))
+    popen = getattr(*_owner_of("services.ConsolePopen"))
     with _replaced("services.ConsolePopen", partial(popen, start_new_session=True)):
         yield
 
@@ -68,7 +68,7 @@ def own_sessions() -> Iterator[None]:
 @contextmanager
 def fewer_processes() -> Iterator[None]:
     """Do not start the processes of LEFT_OUT; an existing cluster starts none anyway."""
-    whole = getattr(*_place("parameter.RayParams"))
+    whole = getattr(*_owner_of("parameter.RayParams"))
     known = inspect.signature(whole).parameters
     fewer = partial(whole, **{name: value for name, value in LEFT_OUT.items() if name in known})
     with _replaced("parameter.RayParams", fewer):
@@ -88,7 +88,7 @@ def at_loopback() -> Iterator[None]:
 @contextmanager
 def _replaced(name: str, value: object) -> Iterator[None]:
     """Replace a private name of Ray until the end of the context."""
-    module, attribute = _place(name)
+    module, attribute = _owner_of(name)
     before = getattr(module, attribute)
     setattr(module, attribute, value)
     try:
@@ -97,7 +97,7 @@ def _replaced(name: str, value: object) -> Iterator[None]:
         setattr(module, attribute, before)
 
 
-def _place(name: str) -> tuple[Any, str]:
+def _owner_of(name: str) -> tuple[Any, str]:
     """Return the module below ``ray._private`` and the name in it."""
     module, _, attribute = name.partition(".")
     return getattr(ray._private, module, None), attribute

@@ -208,7 +208,7 @@ class RemoteTrial:
         for file, pieces in missing.items():
             if pieces is not None:
                 start = pieces[0].start if pieces else 0
-                _place(trial, file, start, b"".join(data[piece] for piece in pieces))
+                _write_at(trial, file, start, b"".join(data[piece] for piece in pieces))
         for file in before.commit.files.keys() - commit.files.keys():
             if not CHECKPOINT.fullmatch(file):  # of an attempt before: its traceback, for example
                 (trial.folder / file).unlink(missing_ok=True)
@@ -394,7 +394,7 @@ def _writing(trial: TrialStore) -> Iterator[None]:
         raise StorageError(f"{trial.folder}: cannot be written ({error.strerror or error})") from error
 
 
-def _place(trial: TrialStore, name: str, start: int, data: bytes) -> None:
+def _write_at(trial: TrialStore, name: str, start: int, data: bytes) -> None:
     """Append bytes to a file, or replace the whole file, and a link in its place.
 
     Raises:

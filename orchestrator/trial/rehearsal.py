@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from recrl.agents.agent import final_policy
-from recrl.agents.registry import agent_config, make_agent
+from recrl.agents.registry import AGENTS, agent_config, make_agent
 from recrl.agents.spaces import environment_actions
 from recrl.orchestrator.errors import USERS_ERRORS, described
 from recrl.orchestrator.files.checkpoint_format import encode
@@ -27,7 +28,7 @@ from recrl.teachers.teacher import TeacherSpec
 
 UPDATES_BEFORE, UPDATES_AFTER = 2, 3  # the restart; the last update is in the deployment phase
 MOST_ENVIRONMENTS, MOST_STEPS = 2, 16
-MINIBATCH = 2  # so small that an update has several, as in a trial
+MINIBATCH = 8  # of an own agent: so small that an update has several, as in a trial
 SAVED = "what changes must be in the saved state"
 DETERMINED = f"{SAVED}; reset(seed=...) and the actions must determine an episode"
 NOISE = 0.1
@@ -46,7 +47,7 @@ def rehearse(spec: TrialSpec) -> None:
     """Run the beginning of a small copy of a trial twice: without interruption, and with a restart.
 
     Args:
-        spec: of the trial; environments, steps and updates are fewer, and minibatches smaller.
+        spec: of the trial; environments, steps, updates and minibatches are fewer or smaller.
 
     Raises:
         RestartError: the second one fails or differs.
@@ -74,10 +75,16 @@ def rehearse(spec: TrialSpec) -> None:
 
 
 def _with_small_minibatches(agent: Choice) -> Choice:
-    """Return an agent whose updates have minibatches also for few samples, if it has minibatches."""
-    if not getattr(agent_config(agent.name, agent.options), "minibatch_size", None):
+    """Return an agent of the user's own with an option ``minibatch_size`` that few samples exceed."""
+    size = getattr(agent_config(agent.name, agent.options), "minibatch_size", None)
+    if agent.name in AGENTS or not isinstance(size, int) or size <= MINIBATCH:
         return agent
-    return replace(agent, options={**agent.options, "minibatch_size": MINIBATCH})
+    options = {**agent.options, "minibatch_size": MINIBATCH}
+    try:
+        agent_config(agent.name, options)
+    except ValidationError:  # too small for it
+        return agent
+    return replace(agent, options=options)
 
 
 def _compare(whole: TrialStore, resumed: TrialStore) -> None:

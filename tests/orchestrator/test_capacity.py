@@ -47,6 +47,8 @@ VERSION_1 = "9:memory:/a\n5:cpu,cpuacct:/slurm/job_7\n0::/init.scope\n"
         ("0::/\n", {"cpu.max": "150000 100000"}, 1),  # in a container
         ("0::/../../other\n", {"cpu.max": "200000 100000"}, 2),
         (VERSION_2, {"cpu.max": "no numbers"}, 4),
+        (VERSION_2, {"cpu.max": "100000 0"}, 4),
+        ("not a list of groups\n", {"cpu.max": "100000 100000"}, 4),
         (VERSION_1, {"cpu/slurm/job_7/cpu.cfs_quota_us": "-1"}, 4),
         (VERSION_1, {"cpu/slurm/job_7/cpu.cfs_quota_us": "200000"}, 2),
         (VERSION_1, {"cpu/cpu.cfs_quota_us": "300000"}, 3),  # a container that sees only its own group

@@ -513,6 +513,8 @@ def test_a_damaged_provenance_never_counts_as_unchanged_code(
         assert sentence.startswith("warning: the code of 1 trial was not checked for changes, because ")
         assert "provenance.json is not what was committed" in sentence
         assert "launch --rerun-damaged" in sentence
+    assert main(["launch", "grid.yaml", *INLINE, "--rerun-damaged"]) == ExitCode.OK
+    assert "not checked" not in capsys.readouterr().out
     trial.provenance_path.unlink()  # a trial that is damaged anyway is said to be so, once
     capsys.readouterr()
     assert main(["plan", "grid.yaml", "--trust"]) == ExitCode.OK

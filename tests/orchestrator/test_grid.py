@@ -110,8 +110,8 @@ def test_ten_mistakes_give_ten_located_sentences() -> None:
         (
             "{name: two-state,",
             "{name: gymnasium, options: {id: lab/Drift-v0},",
-            "2: tasks.0.options.id: Namespace lab not found. Have you installed the proper package for lab; "
-            "if a module registers it, name it as in my_module:lab/Drift-v0",
+            "2: tasks.0.options.id: Namespace lab not found. Have you installed the proper package for lab? "
+            "If a module of yours registers it, write my_module:lab/Drift-v0",
         ),
         ("{total_steps", "{total_step", "6: run.total_step: unknown key; did you mean 'total_steps'?"),
         ("{name: two", "{nam: two", "2: tasks.0.nam: unknown key; did you mean 'name'?"),

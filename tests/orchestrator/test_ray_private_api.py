@@ -25,7 +25,7 @@ Then run tests/orchestrator/test_ray_*.py, and set NEWEST and RANGE there and th
 
 @pytest.mark.parametrize("name", private_api.NAMES)
 def test_the_installed_ray_has_the_names(name: str) -> None:
-    module, attribute = private_api._place(name)
+    module, attribute = private_api._owner_of(name)
     assert hasattr(module, attribute), WHAT_TO_DO
 
 
@@ -81,7 +81,7 @@ def test_a_newer_ray_is_used_with_a_warning(
     ],
 )
 def test_a_patch_lasts_as_long_as_its_context(patch: Any, name: str) -> None:
-    place: Any = private_api._place(name)
+    place: Any = private_api._owner_of(name)
     before = getattr(*place)
     with pytest.raises(KeyError), patch():
         assert getattr(*place) is not before

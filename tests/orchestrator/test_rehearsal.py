@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from recrl.orchestrator.errors import GridError
+from recrl.orchestrator.grid import curriculum_questions
 from recrl.orchestrator.grid.checking import parse_grid
 
 OWN = '''\
@@ -37,6 +38,14 @@ class Room(gymnasium.Env):
     def step(self, action):
         self.steps += 1
         return np.zeros(2, np.float32), 1.0, False, self.steps == 7, {"cost": float(action)}
+
+
+class Wandering(Room):
+    """No observation repeats."""
+
+    def step(self, action):
+        _, *rest = super().step(action)
+        return self.np_random.uniform(-1.0, 1.0, 2).astype(np.float32), *rest
 
 
 class Unseeded(Room):
@@ -253,12 +262,17 @@ class ByPart(WholeBatch):
         return self.ascend(policy, experience, objective, generator)
 
 
-def ascending(rule):
+class LargeMinibatches(AscentConfig):
+    minibatch_size: int = Field(256, ge=32)
+
+
+def ascending(rule, config=AscentConfig):
     make = lambda cmdp, options, seed: fresh_agent(cmdp, options, seed, lambda it: rule(options, it))
-    return AgentEntry(rule.__name__, AscentConfig, make)
+    return AgentEntry(rule.__name__, config, make)
 
 
 WHOLE_BATCH, BY_PART = map(ascending, (WholeBatch, ByPart))
+LARGE = ascending(ByPart, LargeMinibatches)
 
 
 class Staircase:
@@ -312,6 +326,50 @@ class LateLow(Staircase):
         return CurriculumStep(CostLimits((limit,))), {"update": report.update}
 
 
+class Unclamped(Staircase):
+    """Right up to the last question of a trial; one update later it would be below d_d."""
+
+    def step(self, state, report):
+        return self.at_fraction(report, report.env_steps / self.spec.train_steps)
+
+    def start(self):
+        return CurriculumStep(self.spec.train_limits), {"update": 0}
+
+    def at_fraction(self, report, p):
+        pairs = zip(self.spec.train_limits, self.spec.deploy_limits)
+        limits = tuple((1.0 - p) * high + p * low if high < np.inf else high for high, low in pairs)
+        return CurriculumStep(CostLimits(limits)), {"update": report.update, "mean": float("nan")}
+
+
+class Hyperbolic(Unclamped):
+    """Divides by the steps that remain."""
+
+    def step(self, state, report):
+        left = self.spec.train_steps - report.env_steps
+        return self.at_fraction(report, 1.0 - min(1.0, left / (report.env_steps / left)))
+
+
+class Counting(Unclamped):
+    """Refuses gaps in the numbers of episodes, and episodes that cannot be."""
+
+    def start(self):
+        return CurriculumStep(self.spec.train_limits), {"update": 0, "seen": 0, "at": 0}
+
+    def step(self, state, report):
+        if report.update == state["update"]:
+            return CurriculumStep(self.spec.train_limits), state
+        assert report.update == state["update"] + 1 and report.env_steps > state["at"]
+        for number, episode in enumerate(report.episodes, state["seen"]):
+            assert episode.index == number
+        for episode in report.episodes:
+            assert 0 <= episode.begin_step < episode.end_step <= report.env_steps
+            assert episode.limits == self.spec.train_limits and min(episode.costs) >= 0.0
+        seen = state["seen"] + len(report.episodes)
+        return CurriculumStep(self.spec.train_limits), {
+            "update": report.update, "seen": seen, "at": report.env_steps
+        }
+
+
 class TooLow(Staircase):
     def step(self, state, report):
         return CurriculumStep(CostLimits((0.5,))), {"update": report.update}
@@ -361,6 +419,9 @@ KINDS = (Staircase, TooLow, NoStep, Long, Remembering, Changing, Misspelt, Measu
 STAIRCASE, TOO_LOW, NO_STEP, LONG, REMEMBERING, CHANGING, MISSPELT, MEASURING, LATE = (
     TeacherKind(kind.__name__, NoOptions, kind) for kind in KINDS
 )
+UNCLAMPED, HYPERBOLIC, COUNTING = (
+    TeacherKind(kind.__name__, NoOptions, kind) for kind in (Unclamped, Hyperbolic, Counting)
+)
 TOO_LOW_LATER, RISING, STRAIGHT, AS_TEXT = map(decaying, (too_low_later, rising, straight, as_text))
 UNDECLARED = decaying(straight, measures_start=False)
 LOOSE, STRICT, RENAMED, SHORTHAND = (
@@ -390,15 +451,17 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def problems(
+    *,
     task: str = "two-state",
     agents: Sequence[str] = ("cpo",),
     methods: Sequence[str | dict[str, Any]] = ("none",),
     train_limits: str = "5",
+    deploy_limits: str = "2",
     total_steps: int = 10_000,
 ) -> list[str]:
     data = f"""\
 name: own
-tasks: [{{name: "{task}", deploy_limits: 2, train_limits: {train_limits}}}]
+tasks: [{{name: "{task}", deploy_limits: {deploy_limits}, train_limits: {train_limits}}}]
 agents: {list(agents)}
 methods: {list(methods)}
 seeds: 1
@@ -414,7 +477,10 @@ run: {{total_steps: {total_steps}}}
 def test_what_works_and_resumes_is_right() -> None:
     assert problems(task="own_rehearsed:Room") == []
     assert problems(agents=["own_rehearsed:REORDERED"], methods=["own_rehearsed:LONG"]) == []
-    assert problems(task="own_rehearsed:Room", agents=["own_rehearsed:BY_PART"]) == []
+    assert (
+        problems(task="own_rehearsed:Wandering", agents=["own_rehearsed:BY_PART", "own_rehearsed:LARGE"])
+        == []
+    )
 
 
 def test_a_task_whose_episodes_do_not_follow_from_their_seed() -> None:
@@ -497,9 +563,9 @@ def test_an_agent(agent: str, sentence: str) -> None:
 
 def test_an_agent_that_is_wrong_only_in_minibatches() -> None:
     """A rehearsal has few samples, and yet several minibatches."""
-    (problem,) = problems(task="own_rehearsed:Room", agents=["own_rehearsed:WHOLE_BATCH"])
+    (problem,) = problems(task="own_rehearsed:Wandering", agents=["own_rehearsed:WHOLE_BATCH"])
     assert (
-        "fails in its first updates: RuntimeError: inconsistent tensor size, expected tensor [2]" in problem
+        "fails in its first updates: RuntimeError: inconsistent tensor size, expected tensor [8]" in problem
     )
 
 
@@ -538,6 +604,37 @@ def test_a_curriculum(curriculum: str, sentence: str) -> None:
     (problem,) = problems(methods=[f"own_rehearsed:{curriculum}"])
     assert problem.startswith(f"grid.yaml:4: methods.0: own_rehearsed:{curriculum} ")
     assert sentence in problem
+
+
+@pytest.mark.parametrize("curriculum", ["UNCLAMPED", "HYPERBOLIC", "COUNTING", "LONG", "STRAIGHT"])
+@pytest.mark.parametrize("deploy_limits", ["2", "0"])
+@pytest.mark.parametrize("total_steps", [10_000, 1_000_000])
+def test_a_right_curriculum_is_not_refused(curriculum: str, deploy_limits: str, total_steps: int) -> None:
+    assert (
+        problems(
+            methods=[f"own_rehearsed:{curriculum}"], deploy_limits=deploy_limits, total_steps=total_steps
+        )
+        == []
+    )
+
+
+@pytest.mark.parametrize(
+    ("task", "train_limits", "deploy_limits"),
+    [("two-state", "auto", "2"), ("two-state-2", "[9, 9]", "[3, 0]"), ("two-state-2", "auto", "[3, 3]")],
+)
+def test_a_right_curriculum_may_measure_and_have_several_costs(
+    task: str, train_limits: str, deploy_limits: str
+) -> None:
+    of = partial(problems, task=task, train_limits=train_limits, deploy_limits=deploy_limits)
+    assert of(methods=["own_rehearsed:COUNTING"]) == []
+    assert of(methods=["own_rehearsed:STRAIGHT"]) == []
+
+
+def test_a_slow_curriculum_is_asked_for_a_few_seconds_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """But about the last update always."""
+    monkeypatch.setattr(curriculum_questions, "MOST_SECONDS", 0.0)
+    (problem,) = problems(methods=["own_rehearsed:LATE"])
+    assert "the limit of wear is 0.5 after update 1, below its deploy_limits" in problem
 
 
 @pytest.mark.parametrize(

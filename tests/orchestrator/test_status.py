@@ -164,6 +164,20 @@ def test_the_tables_have_a_line_for_every_trial(tmp_path: Path) -> None:
         assert text.count(spec.trial_id) == 2
 
 
+def test_the_plan_does_not_say_how_far_a_damaged_trial_is(tmp_path: Path) -> None:
+    store = SweepStore(tmp_path, "status")
+    writer = store.trial(SPECS[0]).begin(SPECS[0])
+    writer.append_update({"update": 1})
+    writer.commit({}, update=1, env_steps=100)
+    store.trial(SPECS[0]).updates_path.unlink()
+    console = Console(file=io.StringIO(), width=160)
+    console.print(display.plan_table(make_plan(SPECS, store)))
+    assert isinstance(console.file, io.StringIO)
+    first, second = console.file.getvalue().splitlines()[-len(SPECS) :][:2]
+    assert ("repair" in first, "?" in first, "0%" in first) == (True, True, False)
+    assert ("new" in second, "?" in second, "0%" in second) == (True, False, True)
+
+
 @pytest.mark.parametrize("terminal", [True, False])
 def test_no_number_of_a_table_is_shortened(terminal: bool) -> None:
     """Only a terminal has a width; there the verdict is wrapped."""

@@ -22,6 +22,7 @@ import pandas as pd
 import pytest
 from sqlalchemy import make_url
 
+import recrl
 from recrl.analysis.data import sweep_data
 from recrl.analysis.report import table_files as sweep_tables
 from recrl.environments.cmdp import CostLimits
@@ -919,6 +920,28 @@ def test_a_launch_without_figures_measures_the_final_policies_for_mlflow(
     monkeypatch.setattr("recrl.orchestrator.launch_grid._sync_to", lambda uri: lambda store: fake)
     assert main(LAUNCH) == ExitCode.OK
     assert fake.found == ["outcomes.csv"]
+
+
+def test_outcomes_that_cannot_be_written_end_no_launch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError("no room")
+
+    monkeypatch.chdir(tmp_path)
+    Path("grid.yaml").write_text(GRID)
+    fake = FakeSync(SweepStore(Path("runs"), "small"))
+    monkeypatch.setattr("recrl.orchestrator.launch_grid._sync_to", lambda uri: lambda store: fake)
+    monkeypatch.setattr("recrl.analysis.report.table_files.write_outcomes", full)
+    assert main(LAUNCH) == ExitCode.OK
+    assert (
+        "MLflow     has no outcomes of the final policies (OSError: no room)\n"
+        "           to send them later: recrl-sweep sync small\n"
+    ) in capsys.readouterr().out
+    with pytest.warns(
+        UserWarning, match=r"MLflow has no outcomes of the final policies \(OSError: no room\)"
+    ):
+        recrl.launch("grid.yaml", root="other", executor="inline", figures=False, progress=False)
 
 
 def test_sync_measures_the_final_policies_that_no_report_has(

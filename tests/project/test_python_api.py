@@ -193,7 +193,7 @@ def test_a_trial_that_fails_raises_with_its_traceback(folder: Path, monkeypatch:
     assert "Traceback" in error.value.__notes__[0]
 
 
-def test_a_failed_trial_runs_again_after_its_cause_is_mended(
+def test_a_failed_trial_runs_again_after_its_cause_is_corrected(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """``train`` always tries again, ``launch`` if asked."""
