@@ -254,13 +254,15 @@ with SweepStore(Path(sys.argv[1]), "sweep").lock(), locked(Path(sys.argv[1]) / "
     child = os.fork()
     if not child:
         os.close(1)
-        time.sleep(60)
+        os.close(2)  # else the test waits until this process has ended, and finds no lock in any case
+        time.sleep(600)
         os._exit(0)
     print(child, flush=True)
     {ending}
 """
     done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True)
     try:
+        os.kill(int(done.stdout), 0)  # it is there
         assert not SweepStore(tmp_path, "sweep").is_locked()
         with opened_lock(tmp_path / "lock") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
