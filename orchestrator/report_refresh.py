@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from functools import partial
 
 from recrl.orchestrator.background_thread import background_thread
+from recrl.orchestrator.errors import StorageError
 from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.redaction import redacted
 
@@ -65,7 +66,7 @@ def sketch_command(store: SweepStore) -> list[str]:
 def _refresh(store: SweepStore, wait: float, interval: float, over: threading.Event) -> None:
     is_logged = False
     while not over.wait(wait):
-        if not any(trial.record().update for trial in store.trials()):  # nothing to draw yet
+        if not _has_updates(store):
             wait = interval
             continue
         began = time.monotonic()
@@ -78,6 +79,14 @@ def _refresh(store: SweepStore, wait: float, interval: float, over: threading.Ev
                 problem,
             )
         wait = max(interval, REST * (time.monotonic() - began))
+
+
+def _has_updates(store: SweepStore) -> bool:
+    """Whether there is something to draw, and the disk can be read."""
+    try:
+        return any(trial.record().update for trial in store.trials())
+    except StorageError:
+        return False
 
 
 def _sketch(store: SweepStore, over: threading.Event) -> str:
