@@ -59,7 +59,7 @@ class LaunchOptions:
         max_concurrent: largest number of parallel trials; None for the grid's.
         address: of an existing Ray cluster; None to start one here.
         ship_package: whether to send recrl itself to that cluster.
-        executor: the executor.
+        executor: where the trials run.
         mlflow: whether to log the sweep to MLflow.
         tracking_uri: of MLflow; None for the database in the sweep's folder.
         figures: whether to draw figures and the report, during the sweep and at its end.
