@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from recrl.environments.cmdp import CMDPSpec, CostLimits, CurriculumStep, EpisodeStats, Phase
+from recrl.environments.cmdp import CMDPSpec, CostLimits, EpisodeStats, Phase
 from recrl.orchestrator.spec import TrialSpec
 from recrl.teachers.registry import find_teacher, make_teacher
 from recrl.teachers.static import StaticTeacher
@@ -44,14 +44,14 @@ def ask_through(spec: TrialSpec, cmdp: CMDPSpec) -> None:
     asked = replace(spec.teacher, train_limits=d_t) if is_of_clock else spec.teacher
     teacher, kind, label = make_teacher(asked), find_teacher(spec.method.name), spec.method.label
     check = AnswerCheck(label, cmdp.cost_names, asked.train_limits, asked.deploy_limits)
-    before: CurriculumStep | None = None
     step, state = check.checked(teacher.start())
+    kind.require_declared(step, None, curriculum=label)
     given = _text(state)
     for made_up in _reports(spec, d_t, cmdp.horizon):
-        kind.require_declared(step, before, curriculum=label)
         ended = (replace(it, limits=step.limits, noise=step.policy_noise) for it in made_up.episodes)
         report, before = replace(made_up, episodes=tuple(ended)), step
         step, after = check.checked(teacher.step(state, report), before=before.limits, update=report.update)
+        kind.require_declared(step, before, curriculum=label)
         if _text(state) != given:
             raise ValueError(f"curriculum {label}: step must not change the state that it is given")
         state, given = after, _text(after)
@@ -62,7 +62,6 @@ def ask_through(spec: TrialSpec, cmdp: CMDPSpec) -> None:
                 "report that the state has seen from the state alone, see "
                 "recrl.teachers.teacher.already_seen"
             )
-    kind.require_declared(step, before, curriculum=label)
 
 
 def _finite(train_limits: CostLimits, deploy_limits: CostLimits) -> CostLimits:
@@ -79,8 +78,9 @@ def _reports(spec: TrialSpec, train_limits: CostLimits, horizon: int | None) -> 
         train_limits: d_t, finite, [k].
         horizon: most steps of an episode; None if unknown.
     """
-    generator, last, index, number = np.random.default_rng(0), spec.train_updates - 1, 0, 0
-    end = time.monotonic() + MOST_SECONDS
+    generator, end = np.random.default_rng(0), time.monotonic() + MOST_SECONDS
+    index = number = 0  # of episodes and reports so far
+    last = spec.train_updates - 1
     for update in np.linspace(1, last, min(last, MOST_UPDATES), dtype=int).tolist():
         if time.monotonic() > end and update != last:
             continue
