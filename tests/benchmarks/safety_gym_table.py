@@ -141,10 +141,14 @@ def control_differences(rows: pd.DataFrame, baselines: Sequence[str]) -> Iterato
 
 
 def curve(updates: pd.DataFrame, period: int = PERIOD) -> pd.DataFrame:
-    """Return means over seeds and over the updates that end in each ``period`` steps, by curriculum."""
+    """Return means over seeds and over the updates that end in each ``period`` steps.
+
+    A row is an agent, a curriculum and a period.
+    """
     begin = (updates["end_step"] - 1) // period * period
+    keys = ["agent", "method", "from_step"]
     columns = ["episode_return", "cost_0", "limit_0", "multiplier_0"]
-    means = updates.assign(from_step=begin).groupby(["method", "from_step"], observed=True)[columns].mean()
+    means = updates.assign(from_step=begin).groupby(keys, observed=True)[columns].mean()
     return means.round(2).reset_index()
 
 
