@@ -285,6 +285,12 @@ class LagrangianConfig(Options):
         "episode cost, multipliers in standard deviations of the reward advantages "
         "per unit of cost (paper).",
     )
+    multiplier_error_decay: Annotated[float, Field(ge=0.0, lt=1.0)] = Field(
+        default=0.0,
+        description="How much of the average of squared standard errors remains in an update, with "
+        "multiplier_unit: relative. 0: a violation is divided by the error of its own update. 0.9 if "
+        "costs are rare (ours).",
+    )
     multiplier_step: Positive = Field(
         default=0.1,
         description="Step of the dual ascent, K_I, or Adam's learning rate (ours; paper 0.05). With "
@@ -319,6 +325,8 @@ class LagrangianConfig(Options):
             require_effect(self, ["multiplier_proportional"], deciding)
         if self.multiplier_rule == "softplus-adam":
             require_effect(self, ["multiplier_maximum"], deciding)
+        if self.multiplier_unit == "cost":
+            require_effect(self, ["multiplier_error_decay"], "multiplier_unit: cost")
         return self
 
 

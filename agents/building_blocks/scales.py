@@ -56,6 +56,43 @@ class RunningScale:
         self._mean_squares = np.array(state["mean_squares"], np.float64)
 
 
+class MovingScale:
+    """Root of a moving average of m squares, in which the newest update has the weight 1 - ``decay``.
+
+    Args:
+        decay: at least 0, below 1; with 0 the scale is that of the newest update.
+        size: m.
+    """
+
+    def __init__(self, decay: float, size: int) -> None:
+        self._decay = decay
+        self._weight = 0.0
+        self._squares: Floats = np.zeros(size)
+
+    def including(self, values: Floats) -> Floats:
+        """Include one update's values, [m], at least 0; return the scales, [m].
+
+        >>> scale = MovingScale(0.5, 1)
+        >>> scale.including(np.array([2.0])), scale.including(np.array([5.0])) ** 2
+        (array([2.]), array([18.]))
+        """
+        if self._decay == 0.0:
+            return values
+        self._weight = self._decay * self._weight + 1.0 - self._decay
+        self._squares = self._decay * self._squares + (1.0 - self._decay) * values**2
+        scales: Floats = np.sqrt(self._squares / self._weight)
+        return scales
+
+    def state_dict(self) -> dict[str, Any]:
+        """The weights of all updates so far together, and the weighted sum of their squares, [m]."""
+        return {"weight": self._weight, "squares": self._squares.copy()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue exactly where ``state_dict`` was taken."""
+        self._weight = float(state["weight"])
+        self._squares = np.array(state["squares"], np.float64)
+
+
 def quotient(dividend: Floats, divisor: Floats) -> Floats:
     """Return ``dividend`` / ``divisor``, element by element; 0 where the divisor is 0.
 

@@ -8,6 +8,10 @@ to the multipliers' units: the agent ascends A_r - sum_i mu_i A_i.
 per unit of cost, the multiplier of the CMDP is lambda_i = mu_i u_i. ``cost`` is the paper's: violations in
 episode cost, standardised reward advantages, raw cost advantages.
 
+A relative violation is divided by a standard error. The error of one update is large where its mean cost is,
+so violations count less than slack, and the mean cost settles above the limit. ``multiplier_error_decay``
+replaces it by the root of a moving average of squared errors.
+
 A cost with an infinite limit has the multiplier 0.
 
 Notation: N samples, k costs.
@@ -22,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from recrl.agents.building_blocks.advantages import penalised_advantages, reward_spread
+from recrl.agents.building_blocks.scales import MovingScale
 from recrl.agents.constraints.multiplier_rules import (
     STARTS,
     MultiplierState,
@@ -74,6 +79,7 @@ class Multipliers:
         self._is_relative = config.multiplier_unit == "relative"
         self._step = multiplier_step(config)
         self._units = RelativeUnits(num_costs)
+        self._errors = MovingScale(config.multiplier_error_decay, num_costs)
 
     def update(self, experience: Experience) -> Penalty:
         """Update the multipliers; return the scaled advantages."""
@@ -88,21 +94,25 @@ class Multipliers:
         """Update the multipliers; return them, mu, [k]."""
         gaps = constraints.gaps
         if self._is_relative:
-            gaps = relative_gaps(gaps, constraints.limits, constraints.standard_errors)
+            errors = self._errors.including(constraints.standard_errors)
+            gaps = relative_gaps(gaps, constraints.limits, errors)
         self._state = self._step(self._state, gaps)
         return np.where(np.isfinite(constraints.limits), self._state["multipliers"], 0.0)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the rule's state and the units."""
+        """Return the rule's state, the units and the standard errors."""
         return {
             "multipliers": {key: values.copy() for key, values in self._state.items()},
             "units": self._units.state_dict(),
+            "errors": self._errors.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where ``state_dict`` was taken."""
         self._state = {key: np.array(values, np.float64) for key, values in state["multipliers"].items()}
         self._units.load_state_dict(state["units"])
+        if errors := state.get("errors"):  # a checkpoint of an earlier version has none
+            self._errors.load_state_dict(errors)
 
 
 def multiplier_step(config: LagrangianConfig) -> MultiplierRule:

@@ -84,9 +84,10 @@ TASKS = {
 }
 
 
-def train(name: str, agent_name: str, seed: int, options: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+def train(
+    label: str, task: Task, agent_name: str, seed: int, options: Mapping[str, Any]
+) -> Iterator[dict[str, Any]]:
     """Train an agent with some options; yield a row for each policy."""
-    task = TASKS[name]
     limits = CostLimits(task.limits)
     optimum = optimal_return(task.name, task.options, limits)
     start = time.process_time()
@@ -118,7 +119,7 @@ def train(name: str, agent_name: str, seed: int, options: Mapping[str, Any]) -> 
         yield {
             "agent": agent_name,
             "options": json.dumps(dict(options)),
-            "task": name,
+            "task": label,
             "seed": seed,
             "policy": policy,
             "optimum": optimum,
@@ -127,6 +128,28 @@ def train(name: str, agent_name: str, seed: int, options: Mapping[str, Any]) -> 
             "updates": task.updates,
             "cpu_seconds": seconds,
         }
+
+
+def write_trainings(
+    tasks: Mapping[str, Task],
+    agents: Sequence[str],
+    seeds: Sequence[int],
+    options: Mapping[str, Any],
+    *,
+    to: Path | None,
+) -> None:
+    """Train agents on tasks; print each row, and write all of them to a CSV file."""
+    written: list[dict[str, Any]] = []
+    for label, task in tasks.items():
+        for agent in agents:
+            for seed in seeds:
+                for row in train(label, task, agent, seed, options):
+                    print(
+                        "{task} {agent} {seed} {policy}: {regret:.3f} {excess:.3f}".format(**row), flush=True
+                    )
+                    written.append(row)
+                if to:
+                    pd.DataFrame(written).to_csv(to, index=False, float_format="%.4g", lineterminator="\n")
 
 
 def table(rows: pd.DataFrame) -> pd.DataFrame:
@@ -160,19 +183,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(table(rows).round(3).to_string())
         return
     torch.set_num_threads(1)
-    written: list[dict[str, Any]] = []
-    for task in parsed.only:
-        for agent in parsed.agents or AGENTS:
-            for seed in parsed.seeds:
-                written += train(task, agent, seed, parsed.options)
-                for row in written[-len(POLICIES) :]:
-                    print(
-                        "{task} {agent} {seed} {policy}: {regret:.3f} {excess:.3f}".format(**row), flush=True
-                    )
-                if parsed.to:
-                    pd.DataFrame(written).to_csv(
-                        parsed.to, index=False, float_format="%.4g", lineterminator="\n"
-                    )
+    chosen = {name: TASKS[name] for name in parsed.only}
+    write_trainings(chosen, parsed.agents or AGENTS, parsed.seeds, parsed.options, to=parsed.to)
 
 
 if __name__ == "__main__":
