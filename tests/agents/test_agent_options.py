@@ -49,6 +49,7 @@ OTHERS: dict[str, tuple[Any, dict[str, Any]]] = {
     "metric_samples": (3, {"compaction": False}),
     "min_std": (0.9, {}),
     "minibatch_size": (10, {"compaction": False}),
+    "multiplier_error_decay": (0.9, {}),
     "multiplier_initial": (3.0, {}),
     "multiplier_maximum": (0.001, {}),
     "multiplier_proportional": (0.0, {}),
@@ -110,6 +111,7 @@ def _learnt(agent: str, task: str, options_json: str) -> bytes:
 @pytest.mark.parametrize("agent", AGENTS)
 def test_another_value_of_an_option_gives_another_agent(agent: str) -> None:
     known = set(agent_config(agent, {}).model_dump())
+    assert known <= ELSEWHERE | OTHERS.keys(), "give new options another value in OTHERS"
     without_effect = []
     for option in sorted(known - ELSEWHERE):
         value, needed = OTHERS[option]
@@ -124,6 +126,11 @@ def test_another_value_of_an_option_gives_another_agent(agent: str) -> None:
     ("agent", "options", "sentence"),
     [
         ("cpo", {"cvar_level": 0.5}, "cvar_level has no effect with constraint: mean: leave it out, got 0.5"),
+        (
+            "ppo-lag",
+            {"multiplier_unit": "cost", "multiplier_error_decay": 0.9},
+            "multiplier_error_decay has no effect with multiplier_unit: cost: leave it out, got 0.9",
+        ),
         (
             "cpo",
             {"encoder": "none", "proximity_scales": [1.0]},

@@ -53,7 +53,12 @@ def learnt(
 
 
 def options_of(rule: str) -> dict[str, Any]:
-    return {"multiplier_rule": rule, "multiplier_initial": 0.5, "multiplier_step": 0.1}
+    return {
+        "multiplier_rule": rule,
+        "multiplier_initial": 0.5,
+        "multiplier_step": 0.1,
+        "multiplier_error_decay": 0.5,
+    }
 
 
 @pytest.mark.parametrize("task", LIMITS)

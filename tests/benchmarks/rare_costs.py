@@ -1,11 +1,12 @@
 """Whether agents with multipliers keep a limit where costs are rare and high, by exact values.
 
     OMP_NUM_THREADS=1 python -m tests.benchmarks.rare_costs [agent ...] --seeds 60 61 --to rows.csv
-    python -m tests.benchmarks.rare_costs --table rows.csv
+    python -m tests.benchmarks.rare_costs --table control.csv rows.csv
 
 In three tasks a hasty step earns more than a careful one, and rarely leads to a costly accident. The limits
 allow about one accident in 50 episodes. As 16 episodes end in an update, most updates see none. The rows are
-those of ``known_optima.py``. The table has the mean cost as a multiple of the limit, and the regret.
+those of ``known_optima.py``. The tables have the mean cost as a multiple of the limit, and the regret. The
+last one compares the first file with the others, by pairs of agent, task and seed.
 
 Rule for ``multiplier_error_decay``, set after one training of ``ppo-lag`` on ``accident`` (seed 1) with each
 of the values 0 and 0.9, and before those with the seeds 60 to 62. Expected: with 0 the mixture costs 2 to 4
@@ -26,17 +27,19 @@ import numpy as np
 import pandas as pd
 import torch
 from pydantic import Field
+from scipy.stats import permutation_test
 
 from recrl.environments.cmdp import CostLimits
 from recrl.environments.finite.exact_solver import solve_by_lagrangian
 from recrl.environments.finite.finite_cmdp import FiniteCMDP, FiniteVectorEnv
 from recrl.environments.options import Options
 from recrl.environments.registry import Task
+from tests.benchmarks.known_optima import POLICIES, write_trainings
 from tests.benchmarks.known_optima import Task as Training
-from tests.benchmarks.known_optima import write_trainings
 
 AGENTS = ("ppo-lag", "trpo-lag", "focops")  # those with multipliers
 EPISODES = 16  # that end in an update
+FLIPS = 99_999  # of signs
 
 
 class WorkOptions(Options):
@@ -104,12 +107,31 @@ TRAININGS = {
 }
 
 
-def table(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the cost as a multiple of the limit, and the regret, means with standard errors over seeds."""
+def with_multiples(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows with the mean cost as a multiple of the limit."""
     limits = rows["task"].map({name: training.limits[0] for name, training in TRAININGS.items()})
-    measured = rows.assign(multiple=1.0 + rows["excess"] / limits)
-    groups = measured.groupby(["task", "agent", "options", "policy"], sort=False)[["multiple", "regret"]]
+    return rows.assign(multiple=1.0 + rows["excess"] / limits)
+
+
+def means(rows: pd.DataFrame, *keys: str) -> pd.DataFrame:
+    """Return means and standard errors over the rows with equal ``keys``, options and policy."""
+    groups = rows.groupby([*keys, "options", "policy"], sort=False)[["multiple", "regret"]]
     return groups.agg(["mean", "sem", "size"]).reset_index()
+
+
+def comparison(control: pd.DataFrame, changed: pd.DataFrame) -> pd.DataFrame:
+    """Return mean differences of pairs, with p values by flips of signs, for each policy and column."""
+    lines = []
+    for policy in POLICIES:
+        for column in ("multiple", "regret"):
+            keys = ["task", "agent", "seed"]
+            rows = [it[it["policy"] == policy].set_index(keys)[column] for it in (control, changed)]
+            differences = (rows[1] - rows[0]).dropna().to_numpy()
+            test = permutation_test(
+                (differences,), np.mean, permutation_type="samples", n_resamples=FLIPS, rng=0
+            )
+            lines.append((policy, column, len(differences), differences.mean(), test.pvalue))
+    return pd.DataFrame(lines, columns=["policy", "column", "pairs", "difference", "p"])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -120,10 +142,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--options", type=json.loads, default={}, metavar="JSON")
     parser.add_argument("--to", type=Path, help="the CSV file that the rows are written to")
-    parser.add_argument("--table", nargs="+", type=Path, help="print the table of these CSV files")
+    parser.add_argument("--table", nargs="+", type=Path, help="print the tables of these CSV files")
     parsed = parser.parse_args(arguments)
     if parsed.table:
-        print(table(pd.concat(map(pd.read_csv, parsed.table), ignore_index=True)).round(3).to_string())
+        control, *others = (with_multiples(pd.read_csv(path)) for path in parsed.table)
+        rows = pd.concat([control, *others])
+        for keys in (("task", "agent"), ("task",)):
+            print(means(rows, *keys).round(3).to_string(index=False))
+        for changed in others:
+            print(comparison(control, changed).round(4).to_string(index=False))
         return
     torch.set_num_threads(1)
     chosen = {name: TRAININGS[name] for name in parsed.only}
