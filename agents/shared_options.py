@@ -287,9 +287,8 @@ class LagrangianConfig(Options):
     )
     multiplier_error_decay: Annotated[float, Field(ge=0.0, lt=1.0)] = Field(
         default=0.0,
-        description="How much of the average of squared standard errors remains in an update, with "
-        "multiplier_unit: relative. 0: a violation is divided by the error of its own update. 0.9 if "
-        "costs are rare (ours).",
+        description="How much of the average of squared standard errors remains in an update (ours). With "
+        "0 a relative violation is divided by the error of its own update. Take 0.9 if costs are rare.",
     )
     multiplier_step: Positive = Field(
         default=0.1,

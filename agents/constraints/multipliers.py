@@ -9,7 +9,7 @@ per unit of cost, the multiplier of the CMDP is lambda_i = mu_i u_i. ``cost`` is
 episode cost, standardised reward advantages, raw cost advantages.
 
 A relative violation is divided by a standard error. The error of one update is large where its mean cost is,
-so violations count less than slack, and the mean cost settles above the limit. ``multiplier_error_decay``
+so violations count less than slack. Then the mean cost settles above the limit. ``multiplier_error_decay``
 replaces it by the root of a moving average of squared errors.
 
 A cost with an infinite limit has the multiplier 0.
