@@ -69,7 +69,7 @@ class Claim:
         section: of the paper.
         text: the claim.
         task: of the claim.
-        methods: of the claim, by the grid's names.
+        methods: of the claim, by their labels.
         holds: predicate on rows of ``metrics.outcomes``.
         agent: of the claim; every agent if empty.
     """

@@ -32,7 +32,8 @@ def test_every_frame_begins_with_the_key(finished: Sweep) -> None:
 
 
 def test_every_curriculum_of_ours_has_a_place_in_the_order() -> None:
-    assert sorted(METHOD_ORDER) == sorted(TEACHERS) == sorted(STYLES)
+    assert sorted(METHOD_ORDER) == sorted(TEACHERS), "METHOD_ORDER is in analysis/data/labels.py"
+    assert sorted(STYLES) == sorted(TEACHERS), "STYLES is in analysis/figures/styles.py"
 
 
 def test_methods_come_in_one_order_everywhere(finished: Sweep) -> None:

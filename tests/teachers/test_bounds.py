@@ -15,7 +15,7 @@ from recrl.teachers.bounds import (
     undiscounted_excess,
     weight_sum,
 )
-from recrl.teachers.registry import make_teacher
+from recrl.teachers.registry import TEACHERS, make_teacher
 from recrl.teachers.teacher import ProgressReport, TeacherSpec
 
 # integral_0^1 w(p) dp, as docs/explanation/bounds.md has them
@@ -61,6 +61,11 @@ def test_an_update_that_changes_nothing_exceeds_nothing() -> None:
 )
 def test_the_weights_over_four_policies_by_hand(curriculum: str, weights: float) -> None:
     assert weight_sum(curriculum, 4) == pytest.approx(weights, abs=1e-6)
+
+
+def test_each_curriculum_has_a_bound_or_is_said_to_have_none() -> None:
+    without = {"unconstrained", "cooling"}  # `bound --budget` names them: orchestrator/cli/curricula.py
+    assert set(DECAYS) == TEACHERS.keys() - without, "DECAYS is in teachers/bounds.py"
 
 
 @pytest.mark.parametrize("curriculum", DECAYS)
