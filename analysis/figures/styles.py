@@ -1,9 +1,9 @@
 """Common style of figures: colour, dashes and marker of each method, print sizes, reproducible files.
 
 Most colours are Okabe and Ito's (2008), distinguishable with all common forms of colour blindness; those of
-``cooling``, ``unconstrained`` and most spare styles are ours. Dashes and markers differ in greyscale, too. A known method has the same style in every figure of every sweep;
-others take the spare styles in order of their names. Matplotlib's global state does not change: ``context``
-applies to a ``with`` block.
+``cooling``, ``unconstrained`` and most spare styles are ours. Dashes and markers differ in greyscale, too. A
+known method has the same style in every figure of every sweep; others take the spare styles in order of their
+names. Matplotlib's global state does not change: ``context`` applies to a ``with`` block.
 """
 
 from __future__ import annotations
