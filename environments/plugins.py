@@ -19,7 +19,7 @@ import re
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
@@ -260,24 +260,59 @@ def resolve(name: str, *, kind: str, group: str, ours: Mapping[str, Any]) -> Any
 
     Raises:
         UnknownNameError: the name is not known, and the message names the nearest known names; or its entry
-            point cannot be loaded.
+            point cannot be loaded; or several packages have an entry point of that name.
         UntrustedNameError: it is an import path, and they are refused here.
     """
     if name in ours:
         return ours[name]
-    plugged = {point.name: point for point in entry_points(group=group)}
-    if name in plugged:
-        return _loaded(plugged[name])
+    points = entry_points(group=group)
+    named = [point for point in points if point.name == name]
+    if len({point.value for point in named}) > 1:
+        raise UnknownNameError(
+            f"the {kind} {name!r} is an entry point of several packages, {', '.join(map(_origin, named))}; "
+            "write an import path instead, or uninstall all but one of the packages"
+        )
+    if named:
+        return _loaded(named[0])
     if IMPORT_PATH.fullmatch(name):
         require_trust(name)
         return load_attribute(name)
     if IMPORT_PATH.fullmatch(with_colon := ":".join(name.rsplit(".", 1))):
         raise UnknownNameError(f"no {kind} is called {name!r}; an import path has a colon, {with_colon!r}")
-    known = sorted({*ours, *plugged})
+    known = sorted({*ours, *(point.name for point in points)})
     raise UnknownNameError(
         f"no {kind} is called {name!r}{nearest(name, known)} "
         f"(known: {', '.join(known)}; or an import path package.module:attribute)"
     )
+
+
+def require_visible(name: str, *, kind: str, group: str, ours: Container[str]) -> None:
+    """Check that no package has an entry point with a name of ours, which would never be used.
+
+    Such a package was perhaps there first: then a new version of this one would change what the name means.
+
+    Args:
+        name: of ours, or any other.
+        kind: ``task``, ``agent`` or ``curriculum``.
+        group: the entry-point group.
+        ours: the names of the built-in registry.
+
+    Raises:
+        UnknownNameError: a package has an entry point of this name.
+    """
+    if name not in ours:
+        return
+    for point in entry_points(group=group):
+        if point.name == name:
+            raise UnknownNameError(
+                f"the {kind} {name!r} is recrl's, and also an entry point, {_origin(point)}; rename that "
+                "entry point, or uninstall its package to use recrl's"
+            )
+
+
+def _origin(point: EntryPoint) -> str:
+    package = f" of the package {point.dist.name}" if point.dist is not None else ""
+    return f"{point.value!r}{package}"
 
 
 def _loaded(point: EntryPoint) -> Any:

@@ -12,6 +12,8 @@ counted are which static curriculum is the best in how many tasks, and that the 
 ``dynamic`` and ``linear`` are comparable.
 
 Only trials of the paper's tasks are counted: under its deployment limit (``PAPER_LIMITS``) and with one cost.
+A task or curriculum with a name of the paper as its label is another one if its own name differs. So is an
+agent that is called ``ppo-lag`` or ``cpo``.
 
 The fraction of seeds has Wilson's interval. Beside it is the count for the deployment phase, in which
 learning goes on. The predicates use the tolerance of ``recrl.analysis.statistics.verdicts``. A failed trial
@@ -29,7 +31,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from recrl.analysis.data.labels import KEY
+from recrl.analysis.data.labels import GROUP, KEY
 from recrl.analysis.statistics.intervals import (
     Interval,
     mean_interval,
@@ -197,7 +199,8 @@ def _is_of_the_paper(trials: pd.DataFrame) -> pd.Series[bool]:
     """Whether each trial is of one of the paper's tasks, under the paper's limit and with one cost."""
     others = [name for name in trials if str(name).startswith("deploy_limit_") and name != "deploy_limit_0"]
     limits = trials["task"].astype(str).map(PAPER_LIMITS)
-    is_named = trials["task_name"] == trials["task"].astype(str) if "task_name" in trials else True
+    task, agent, method = (trials[f"{part}_name"] == trials[part].astype(str) for part in GROUP)
+    is_named = task & method & (agent | ~trials["agent"].isin(PAPER_AGENTS))
     return (trials["deploy_limit_0"] == limits) & trials[others].isna().all(axis=1) & is_named
 
 

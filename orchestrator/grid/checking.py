@@ -20,24 +20,24 @@ budget, T ``rollout_steps``. Limits are undiscounted costs per episode.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from recrl.agents.registry import find_agent
 from recrl.environments.cmdp import CMDPSpec, CostLimits
 from recrl.environments.plugins import (
     UnknownNameError,
     UntrustedNameError,
     WrongKindError,
     nearest,
+    require_visible,
     trusted_attribute,
 )
-from recrl.environments.registry import options_model
 from recrl.orchestrator.errors import USERS_ERRORS, GridError, UntrustedGridError, described, missing
 from recrl.orchestrator.grid.building import BuildError, build_own, cmdp_of
+from recrl.orchestrator.grid.catalogue import KINDS, Kind
 from recrl.orchestrator.grid.checked_grid import GridSpec, TaskCell
 from recrl.orchestrator.grid.curriculum_checks import unsuitable
 from recrl.orchestrator.grid.file_models import Entry, GridFile, Limits, Run, SweepName, TaskEntry
@@ -53,7 +53,6 @@ from recrl.orchestrator.validation_sentences import (
     require_json,
     sentences,
 )
-from recrl.teachers.registry import find_teacher
 
 MAX_TRIALS = 100_000
 ROLLOUT_STEPS = 64  # by default: short rollouts of many environments give many updates
@@ -61,7 +60,6 @@ ROLLOUT_STEPS = 64  # by default: short rollouts of many environments give many 
 DEFAULT_LIMITS: Mapping[str, tuple[float, ...] | None] = {"train_limits": (math.inf,), "deploy_limits": None}
 
 Model = TypeVar("Model", bound=BaseModel)
-ModelOf = Callable[[str], type[BaseModel]]  # of the options of what a name means
 
 
 def read_grid(path: Path, *, build: bool = False) -> GridSpec:
@@ -159,8 +157,8 @@ class _Check:
             return None
         file = self._validated(GridFile, self._raw)
         tasks = self._tasks()
-        agents = self._choices("agents", Entry, lambda name: find_agent(name).config)
-        methods = self._choices("methods", Entry, lambda name: find_teacher(name).config)
+        agents = self._choices(KINDS["agents"], Entry)
+        methods = self._choices(KINDS["curricula"], Entry)
         if file is None or self.problems or self.uncalled:
             return None
         grid = GridSpec(
@@ -229,7 +227,7 @@ class _Check:
         """Return the tasks with correct limits and rollouts."""
         run = _valid(Run, self._raw.get("run"))
         cells = []
-        for index, task in self._choices("tasks", TaskEntry, options_model).items():
+        for index, task in self._choices(KINDS["tasks"], TaskEntry).items():
             try:
                 cmdp = cmdp_of(task)
             except BuildError as error:
@@ -242,38 +240,39 @@ class _Check:
                 cells.append(TaskCell(task, *limits, rollout_steps, cmdp.horizon))
         return cells
 
-    def _choices(self, section: str, model: type[Entry], model_of: ModelOf) -> dict[int, Choice]:
-        """Return the correct entries of a section, by their index."""
+    def _choices(self, kind: Kind, model: type[Entry]) -> dict[int, Choice]:
+        """Return the correct entries of a kind's section, by their index."""
         choices: dict[int, Choice] = {}
-        for index, value in enumerate(_items(self._raw.get(section))):
+        for index, value in enumerate(_items(self._raw.get(kind.section))):
             entry = _valid(model, value)
             if entry is None:  # the schema check has reported why; its name may be wrong as well
                 named = _valid(Entry, _named(value))
                 if named is not None:
-                    self._options((section, index), named, model_of)
+                    self._options((kind.section, index), named, kind)
                 continue
-            options = self._options((section, index), entry, model_of)
+            options = self._options((kind.section, index), entry, kind)
             if options is None:
                 continue
             choice = Choice(entry.name, options, entry.label)
-            self._check_differs((section, index), choice, choices)
+            self._check_differs((kind.section, index), choice, choices)
             choices[index] = choice
         return choices
 
-    def _options(self, place: YamlPath, entry: Entry, model_of: ModelOf) -> dict[str, Any] | None:
+    def _options(self, place: YamlPath, entry: Entry, kind: Kind) -> dict[str, Any] | None:
         """Return the entry's options with defaults, as JSON values."""
         name_place = (*place, "name") if (*place, "name") in self._document.lines else place
-        kind: type[BaseModel] | None = None
+        model_of_options: type[BaseModel] | None = None
         try:
-            kind = model_of(entry.name)
-            model = kind.model_validate(dict(entry.options))
+            require_visible(entry.name, kind=kind.singular, group=kind.group, ours=kind.ours)
+            model_of_options = kind.model(entry.name)
+            model = model_of_options.model_validate(dict(entry.options))
             require_json(entry.options)  # of an untyped option, model_dump writes an infinite number as null
             options = model.model_dump(mode="json")
             require_json(options)
             if reason := _not_read_back(model):
                 raise TypeError(f"its model of options must read back what its model_dump returns ({reason})")
         except ValidationError as error:
-            for inner, sentence in sentences(error, kind):
+            for inner, sentence in sentences(error, model_of_options):
                 self.problems.add((*place, "options", *inner), sentence)
         except (UnknownNameError, WrongKindError) as error:
             self.problems.add(name_place, str(error))

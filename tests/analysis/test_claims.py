@@ -20,7 +20,16 @@ def counted(
     if failed is not None:
         trials = pd.concat([trials, failed.assign(status="failed")])
     trials["deploy_limit_0"] = trials["deploy_limit_0"].fillna(trials["task"].map(claims.PAPER_LIMITS))
-    return claims.count_claims(rows, training, trials)
+    return claims.count_claims(rows, training, named(trials))
+
+
+def named(trials: pd.DataFrame) -> pd.DataFrame:
+    """The trials with their tasks, agents and curricula under their own names, unless a row has another."""
+    named_trials = trials.copy()
+    for part in ("task", "agent", "method"):
+        other = trials.get(f"{part}_name", pd.Series(index=trials.index, dtype=object))
+        named_trials[f"{part}_name"] = other.fillna(trials[part])
+    return named_trials
 
 
 def outcome(task: str, method: str, episode_return: float, cost: float, seed: int = 0) -> dict[str, object]:
@@ -98,7 +107,7 @@ def test_three_curricula_of_a_seed_are_one_seed() -> None:
     more = [outcome("rivergrid-1b", method, 9.5, 5.0, 3) for method in ("linear", "exponential")]
     outcomes = pd.DataFrame([*rows, *more])
     trials = pd.concat([outcomes.assign(status="complete"), pending])
-    weighed = claims.count_claims(outcomes.assign(feasible=False), NO_TRAINING, trials)
+    weighed = claims.count_claims(outcomes.assign(feasible=False), NO_TRAINING, named(trials))
     assert list(weighed[["held", "seeds", "failed"]].iloc[0]) == [3, 3, 0]  # seed 3 may still be either
     lost = pending.drop(columns="status")
     weighed = counted(outcomes, failed=lost)
@@ -192,8 +201,14 @@ def test_a_failed_trial_makes_no_comparison_that_the_sweep_does_not_have() -> No
 def test_the_papers_claims_are_about_its_own_tasks_limits_and_single_cost() -> None:
     rows = [trial(method, 0, 3.0) for method in ("none", "linear")]
     assert len(counted(pd.DataFrame(rows))) == 2
-    for other in ({"deploy_limit_0": 50.0}, {"deploy_limit_1": 9.0}, {"task_name": "mine:CarGoal2"}):
-        assert counted(pd.DataFrame([{"task_name": "CarGoal2", **row, **other} for row in rows])).empty
+    for other in (
+        {"deploy_limit_0": 50.0},
+        {"deploy_limit_1": 9.0},
+        {"task_name": "mine:CarGoal2"},
+        {"agent_name": "cpo"},
+        {"method_name": "cosine"},
+    ):
+        assert counted(pd.DataFrame([{**row, **other} for row in rows])).empty
 
 
 def test_a_task_with_two_costs_hides_no_training_cost_of_the_others() -> None:
@@ -283,7 +298,7 @@ def test_costs_of_a_training_that_failed_or_goes_on_are_not_compared() -> None:
         rows = pd.DataFrame([trial("linear", 0, 1.0)]).assign(feasible=True)
         ended = (training["method"] != "linear") | (training["seed"] != 1)
         trials = training.assign(status=ended.map({True: "complete", False: status}))
-        line = claims.count_claims(rows, training, trials).set_index("claim").loc[claim]
+        line = claims.count_claims(rows, training, named(trials)).set_index("claim").loc[claim]
         assert list(line[["held", "seeds", "failed"]]) == expected
         assert line["difference"] == 10.0
 
@@ -292,6 +307,6 @@ def test_a_comparison_all_of_whose_seeds_failed_holds_nowhere_and_has_no_verdict
     claim = "linear costs more in training than exponential on CarGoal2"
     rows = pd.DataFrame([trial("linear", 0, 1.0)]).assign(feasible=True)
     trials = totals().assign(status="failed")
-    weighed = claims.count_claims(rows, totals(), trials)
+    weighed = claims.count_claims(rows, totals(), named(trials))
     shown = claims_table(weighed).set_index("claim").loc[claim]
     assert list(shown[["holds here", "holds in", "difference"]]) == ["", "0 of 1", ""]

@@ -149,16 +149,33 @@ def test_a_users_callable_is_a_task_by_its_import_path() -> None:
     assert info["cost"].tolist() == [[0.0, 1.0], [0.0, 1.0], [1.0, 0.0]]
 
 
+def install(folder: Path, package: str, entry_point: str) -> None:
+    """Write the metadata of a package with one entry point, a task; its modules are apart."""
+    distribution = folder / f"{package.replace('-', '_')}-1.0.dist-info"
+    distribution.mkdir()
+    (distribution / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    (distribution / "entry_points.txt").write_text(f"[recrl.tasks]\n{entry_point}\n")
+
+
 def test_a_users_task_is_found_by_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "goldrush.py").write_text(
         "from recrl.environments.registry import TASKS\nRUSH = TASKS['two-state']\n"
     )
-    distribution = tmp_path / "goldrush-1.0.dist-info"
-    distribution.mkdir()
-    (distribution / "METADATA").write_text("Metadata-Version: 2.1\nName: goldrush\nVersion: 1.0\n")
-    (distribution / "entry_points.txt").write_text("[recrl.tasks]\nrush = goldrush:RUSH\n")
+    install(tmp_path, "goldrush", "rush = goldrush:RUSH")
     monkeypatch.syspath_prepend(str(tmp_path))
     assert find_task("rush") is TASKS["two-state"]
+
+
+def test_an_entry_point_of_two_packages_names_neither(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path, "gold-rush", "rush = gold:RUSH")
+    install(tmp_path, "silver-rush", "rush = silver:RUSH")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(UnknownNameError) as error:
+        find_task("rush")
+    for part in ("the task 'rush'", "'gold:RUSH' of the package gold-rush", "'silver:RUSH' of the package"):
+        assert part in str(error.value)
 
 
 def test_folders_of_modules_may_overlap_in_several_threads(
@@ -213,10 +230,7 @@ def test_a_broken_entry_point_is_named_with_its_package(
     (tmp_path / "coalrush.py").write_text("import shovel\n")
     (tmp_path / "silverrush.py").write_text("")
     (tmp_path / "bankrupt.py").write_text("raise SystemExit(3)\n")
-    distribution = tmp_path / "gold_rush-1.0.dist-info"
-    distribution.mkdir()
-    (distribution / "METADATA").write_text("Metadata-Version: 2.1\nName: gold-rush\nVersion: 1.0\n")
-    (distribution / "entry_points.txt").write_text(f"[recrl.tasks]\nrush = {target}\n")
+    install(tmp_path, "gold-rush", f"rush = {target}")
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(UnknownNameError) as error:
         find_task("rush")
