@@ -98,7 +98,7 @@ class StaticTeacher:
 
     Args:
         spec: d_t, d_d and B.
-        decay: the limit as a function of progress.
+        decay: the limit as a function of progress; for a decay with options, ``functools.partial`` of it.
         start_fraction: fraction of B for measuring an infinite d_t, as with ``train_limits: auto``; 0 to keep
             it infinite until B.
     """
@@ -163,9 +163,8 @@ class DecayConfig(Options):
 
 def decay_teacher(spec: TeacherSpec, *, decay: Decay) -> StaticTeacher:
     """CLiC_L, CLiC_C or CLiC_E, from d_t, or from the measured costs if d_t is infinite."""
-    return StaticTeacher(
-        spec, decay=decay, start_fraction=DecayConfig.model_validate(spec.options).start_fraction
-    )
+    config = DecayConfig.model_validate(dict(spec.options))
+    return StaticTeacher(spec, decay=decay, start_fraction=config.start_fraction)
 
 
 def none_teacher(spec: TeacherSpec) -> StaticTeacher:

@@ -23,6 +23,7 @@ from recrl.orchestrator.files.sweep_store import SweepStore
 from recrl.orchestrator.files.trial_files import HARD_LANDING, POLICY_NOISE
 from recrl.orchestrator.grid.checking import parse_grid
 from recrl.orchestrator.grid.file_models import GridFile
+from recrl.teachers.registry import TEACHERS
 from tests.project.documentation import DOCS, PAGES, README, ROOT, Fence, fences, label
 
 BASE: dict[str, Any] = {
@@ -172,6 +173,14 @@ def test_every_exit_code_is_explained() -> None:
 def test_every_agent_has_a_page_and_every_page_is_listed() -> None:
     folder = DOCS / "explanation/algorithms"
     assert {page.stem for page in folder.glob("*.md")} == {*AGENTS, "index"}
+
+
+@pytest.mark.parametrize(
+    "page", ["explanation/curricula.md", "explanation/bounds.md", "how-to/limits-and-curricula.md"]
+)
+def test_a_page_on_curricula_names_each_of_them(page: str) -> None:
+    text = (DOCS / page).read_text()
+    assert not [name for name in TEACHERS if f"`{name}`" not in text]
 
 
 def test_no_page_quotes_a_test_that_is_not_there() -> None:
