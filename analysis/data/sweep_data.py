@@ -84,8 +84,8 @@ PHASE_COST_COLUMNS = (("cost", ""), ("cost", "_std"), ("cost", "_total"), ("exce
 EVENT_COLUMNS = ("update", "end_step", "event")
 ROWS = ("phases", "updates", "evaluations", "events", "policies")  # the data frames that it receives
 
-# The agents' metrics in figures and tables; the export file has no others.
-DRAWN_METRICS = re.compile(
+# The agents' metrics in figures, tables and exports; docs/reference/files.md lists them.
+EXPORTED_METRICS = re.compile(
     r"(multiplier|cost_advantage_max)_\d+|explained_variance_(reward|cost_\d+)|kl|case"
 )
 
@@ -368,7 +368,7 @@ def drawn_columns(columns: Iterable[str]) -> list[str]:
     return [
         name
         for name in columns
-        if name in kept or re.fullmatch(r"(cost|limit)_\d+", name) or DRAWN_METRICS.fullmatch(name)
+        if name in kept or re.fullmatch(r"(cost|limit)_\d+", name) or EXPORTED_METRICS.fullmatch(name)
     ]
 
 

@@ -99,9 +99,10 @@ class RowFile:
             self.columns = tuple(row)
             self._rows.append(csv_line(self.columns))
         elif row.keys() != set(self.columns):
+            hint = "; if its code has changed since, use launch --rerun-changed" if self.length else ""
             raise RowError(
                 f"{of}: {_difference(row.keys(), self.columns)} in a row of {self.path.name}; every "
-                "update must give the same metrics as the first"
+                f"update must give the same metrics as the first{hint}"
             )
         self._rows.append(csv_line([row[name] for name in self.columns]))
 

@@ -16,8 +16,8 @@ from recrl.environments.registry import make_vector, optimal_return
 class Training:
     """A task, an agent, limits that bind, how long to learn, and with how many seeds it is tested here.
 
-    Trainings without a seed are only in the table of ``tests/benchmarks/known_optima.py``. An agent knows the
-    mean cost of an update's episodes; those that must know it more precisely have more environments.
+    Trainings without a seed fail: under two limits ``ipo`` earns 0.2 less than the optimum. An agent knows
+    the mean cost of an update's episodes; those that must know it more precisely have more environments.
     """
 
     agent: str

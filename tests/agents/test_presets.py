@@ -42,6 +42,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("agent", AGENTS)
 def test_the_preset_paper_has_the_published_values(agent: str) -> None:
+    assert agent in PUBLISHED, f"give {agent} its published values in PUBLISHED"
     config = agent_config(agent, {"preset": "paper"}).model_dump()
     assert {option: config[option] for option in PUBLISHED[agent]} == PUBLISHED[agent]
     # of every agent: Ray et al. 2019

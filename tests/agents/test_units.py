@@ -13,7 +13,7 @@ import pytest
 
 from recrl.agents.collection import Collector, episode_costs
 from recrl.agents.constraints.multiplier_rules import STARTS
-from recrl.agents.registry import make_agent
+from recrl.agents.registry import AGENTS, make_agent
 from recrl.environments.cmdp import CostLimits, CurriculumStep
 from recrl.environments.registry import make_vector
 
@@ -21,6 +21,10 @@ PENALTIES = ("p3o", "ipo")
 LAGRANGIANS = [(agent, rule) for agent in ("ppo-lag", "trpo-lag", "focops") for rule in STARTS]
 TRUST_REGIONS = ("cpo", "pcpo", "crpo")
 LIMITS = {"two-state": 3.0, "continuous-bandit": 2.5}
+
+
+def test_every_agent_under_a_limit_is_in_one_of_these_groups() -> None:
+    assert {*PENALTIES, *TRUST_REGIONS, *(agent for agent, _ in LAGRANGIANS)} == set(AGENTS) - {"ppo", "trpo"}
 
 
 def learnt(

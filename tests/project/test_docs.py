@@ -117,7 +117,8 @@ def test_every_metric_of_every_agent_is_explained() -> None:
         rollout, finished = collector.collect(agent, np.random.default_rng(0))
         metrics = agent.update(rollout, episode_costs(finished, 1), CurriculumStep(CostLimits((5.0,))))
         for metric in metrics:
-            assert f"`{re.sub(r'_0$', '_i', metric)}`" in explained, f"{name}: {metric}"
+            row = f"`{re.sub(r'_0$', '_i', metric)}`"
+            assert row in explained, f"give {row} of {name} a row in docs/reference/metrics.md"
 
 
 def names_in(rows: str, cell: int = 0) -> list[str]:
@@ -170,9 +171,21 @@ def test_every_exit_code_is_explained() -> None:
     assert not [code for code in ExitCode if f"\n| {code.value} |" not in explained]
 
 
-def test_every_agent_has_a_page_and_every_page_is_listed() -> None:
+def test_every_agent_has_a_page_and_is_listed() -> None:
     folder = DOCS / "explanation/algorithms"
     assert {page.stem for page in folder.glob("*.md")} == {*AGENTS, "index"}
+    assert set(names_in((folder / "index.md").read_text().replace("| [`", "| `"))) == {*AGENTS}
+    readme = README.read_text()
+    assert not [agent for agent in AGENTS if f"`{agent}`" not in readme]
+
+
+def test_the_metrics_of_an_export_are_listed() -> None:
+    section = (REFERENCE / "files.md").read_text().partition("\n### An export\n")[2].partition("Times and")[0]
+    listed = {name for name in re.findall(r"`([^` ]+)`", section) if name != "updates"}
+    metrics = names_in((REFERENCE / "metrics.md").read_text())
+    columns = [re.sub(r"_i$", "_0", name) for name in (*trial_files.UPDATE_COLUMNS, *metrics)]
+    exported = sweep_data.drawn_columns([*columns, "cost_0", "limit_0"])
+    assert listed == {re.sub(r"_0$", "_i", name) for name in exported}
 
 
 @pytest.mark.parametrize(
