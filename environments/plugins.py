@@ -286,10 +286,10 @@ def resolve(name: str, *, kind: str, group: str, ours: Mapping[str, Any]) -> Any
     )
 
 
-def require_visible(name: str, *, kind: str, group: str, ours: Container[str]) -> None:
-    """Check that no package has an entry point with a name of ours, which would never be used.
+def refuse_shadowed_entry_point(name: str, *, kind: str, group: str, ours: Container[str]) -> None:
+    """Check that no package has an entry point with a name of ours, which ``resolve`` would never load.
 
-    Such a package was perhaps there first: then a new version of this one would change what the name means.
+    Otherwise a name of theirs would mean something else after a new version of recrl takes it.
 
     Args:
         name: of ours, or any other.
@@ -311,8 +311,11 @@ def require_visible(name: str, *, kind: str, group: str, ours: Container[str]) -
 
 
 def _origin(point: EntryPoint) -> str:
-    package = f" of the package {point.dist.name}" if point.dist is not None else ""
-    return f"{point.value!r}{package}"
+    return f"{point.value!r}{_of_package(point)}"
+
+
+def _of_package(point: EntryPoint) -> str:
+    return f" of the package {point.dist.name}" if point.dist is not None else ""
 
 
 def _loaded(point: EntryPoint) -> Any:
@@ -321,8 +324,7 @@ def _loaded(point: EntryPoint) -> Any:
     Raises:
         UnknownNameError: its module cannot be imported or has no such attribute.
     """
-    package = f" of the package {point.dist.name}" if point.dist is not None else ""
-    problem = f"the entry point {point.name}{package} cannot load {point.value!r}"
+    problem = f"the entry point {point.name}{_of_package(point)} cannot load {point.value!r}"
     try:
         return point.load()
     except (ImportError, AttributeError) as error:

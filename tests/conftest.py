@@ -230,6 +230,20 @@ def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str, str], None]:
+    """A function that installs a package with one entry point; its module, if any, is in ``tmp_path``."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def write(package: str, group: str, entry_point: str) -> None:
+        distribution = tmp_path / f"{package.replace('-', '_')}-1.0.dist-info"
+        distribution.mkdir()
+        (distribution / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+        (distribution / "entry_points.txt").write_text(f"[{group}]\n{entry_point}\n")
+
+    return write
+
+
+@pytest.fixture
 def unrendered(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures are made but not rendered, which takes a second each: for tests of the files beside them."""
 

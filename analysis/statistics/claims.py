@@ -12,8 +12,8 @@ counted are which static curriculum is the best in how many tasks, and that the 
 ``dynamic`` and ``linear`` are comparable.
 
 Only trials of the paper's tasks are counted: under its deployment limit (``PAPER_LIMITS``) and with one cost.
-A task or curriculum with a name of the paper as its label is another one if its own name differs. So is an
-agent that is called ``ppo-lag`` or ``cpo``.
+Their labels must be their names: a task or curriculum that has only the label of one of the paper's is
+another one. So is an agent that has only the label ``ppo-lag`` or ``cpo``.
 
 The fraction of seeds has Wilson's interval. Beside it is the count for the deployment phase, in which
 learning goes on. The predicates use the tolerance of ``recrl.analysis.statistics.verdicts``. A failed trial
@@ -200,7 +200,7 @@ def _is_of_the_paper(trials: pd.DataFrame) -> pd.Series[bool]:
     others = [name for name in trials if str(name).startswith("deploy_limit_") and name != "deploy_limit_0"]
     limits = trials["task"].astype(str).map(PAPER_LIMITS)
     task, agent, method = (trials[f"{part}_name"] == trials[part].astype(str) for part in GROUP)
-    is_named = task & method & (agent | ~trials["agent"].isin(PAPER_AGENTS))
+    is_named = task & method & (agent | ~trials["agent"].isin(PAPER_AGENTS))  # RiverGrid's are of any agent
     return (trials["deploy_limit_0"] == limits) & trials[others].isna().all(axis=1) & is_named
 
 

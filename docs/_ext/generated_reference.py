@@ -214,10 +214,10 @@ def presets_page() -> str:
     return (
         f"{NOTE}# Presets\n\n`recommended` is every option's default. `preset: paper` sets the "
         "options below to the values of\nsafety-starter-agents, which the paper took over "
-        "unchanged. For `focops`, `p3o`, `ipo` and `crpo` some values are those\nof their own papers. They "
-        "assume "
-        "rollouts of 30,000 steps, which the grid gives: `run: {num_envs: 30, rollout_steps: 1000}`. "
-        "An option given together with `preset` overrides it. The table of options is complete.\n\n"
+        "unchanged. For `focops`, `p3o`, `ipo` and `crpo` some values are those\nof their own papers. "
+        "They assume rollouts of 30,000 steps, which the grid gives: "
+        "`run: {num_envs: 30, rollout_steps: 1000}`. An option given together with `preset` overrides it. "
+        "The table of options is complete.\n\n"
         f"{presets.table()}\n"
     )
 

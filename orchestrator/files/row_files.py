@@ -99,7 +99,7 @@ class RowFile:
             self.columns = tuple(row)
             self._rows.append(csv_line(self.columns))
         elif row.keys() != set(self.columns):
-            hint = "; if its code has changed since, use launch --rerun-changed" if self.length else ""
+            hint = "; if code has changed since the first, use launch --rerun-changed" if self.length else ""
             raise RowError(
                 f"{of}: {_difference(row.keys(), self.columns)} in a row of {self.path.name}; every "
                 f"update must give the same metrics as the first{hint}"

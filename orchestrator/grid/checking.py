@@ -32,7 +32,7 @@ from recrl.environments.plugins import (
     UntrustedNameError,
     WrongKindError,
     nearest,
-    require_visible,
+    refuse_shadowed_entry_point,
     trusted_attribute,
 )
 from recrl.orchestrator.errors import USERS_ERRORS, GridError, UntrustedGridError, described, missing
@@ -263,7 +263,7 @@ class _Check:
         name_place = (*place, "name") if (*place, "name") in self._document.lines else place
         model_of_options: type[BaseModel] | None = None
         try:
-            require_visible(entry.name, kind=kind.singular, group=kind.group, ours=kind.ours)
+            refuse_shadowed_entry_point(entry.name, kind=kind.singular, group=kind.group, ours=kind.ours)
             model_of_options = kind.model(entry.name)
             model = model_of_options.model_validate(dict(entry.options))
             require_json(entry.options)  # of an untyped option, model_dump writes an infinite number as null

@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -149,29 +150,19 @@ def test_a_users_callable_is_a_task_by_its_import_path() -> None:
     assert info["cost"].tolist() == [[0.0, 1.0], [0.0, 1.0], [1.0, 0.0]]
 
 
-def install(folder: Path, package: str, entry_point: str) -> None:
-    """Write the metadata of a package with one entry point, a task; its modules are apart."""
-    distribution = folder / f"{package.replace('-', '_')}-1.0.dist-info"
-    distribution.mkdir()
-    (distribution / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
-    (distribution / "entry_points.txt").write_text(f"[recrl.tasks]\n{entry_point}\n")
-
-
-def test_a_users_task_is_found_by_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_users_task_is_found_by_entry_point(
+    tmp_path: Path, install: Callable[[str, str, str], None]
+) -> None:
     (tmp_path / "goldrush.py").write_text(
         "from recrl.environments.registry import TASKS\nRUSH = TASKS['two-state']\n"
     )
-    install(tmp_path, "goldrush", "rush = goldrush:RUSH")
-    monkeypatch.syspath_prepend(str(tmp_path))
+    install("goldrush", "recrl.tasks", "rush = goldrush:RUSH")
     assert find_task("rush") is TASKS["two-state"]
 
 
-def test_an_entry_point_of_two_packages_names_neither(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    install(tmp_path, "gold-rush", "rush = gold:RUSH")
-    install(tmp_path, "silver-rush", "rush = silver:RUSH")
-    monkeypatch.syspath_prepend(str(tmp_path))
+def test_an_entry_point_of_two_packages_names_neither(install: Callable[[str, str, str], None]) -> None:
+    install("gold-rush", "recrl.tasks", "rush = gold:RUSH")
+    install("silver-rush", "recrl.tasks", "rush = silver:RUSH")
     with pytest.raises(UnknownNameError) as error:
         find_task("rush")
     for part in ("the task 'rush'", "'gold:RUSH' of the package gold-rush", "'silver:RUSH' of the package"):
@@ -225,13 +216,12 @@ def test_a_module_of_the_same_name_in_another_folder_is_not_confused_with_it(
     ],
 )
 def test_a_broken_entry_point_is_named_with_its_package(
-    target: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    target: str, reason: str, tmp_path: Path, install: Callable[[str, str, str], None]
 ) -> None:
     (tmp_path / "coalrush.py").write_text("import shovel\n")
     (tmp_path / "silverrush.py").write_text("")
     (tmp_path / "bankrupt.py").write_text("raise SystemExit(3)\n")
-    install(tmp_path, "gold-rush", f"rush = {target}")
-    monkeypatch.syspath_prepend(str(tmp_path))
+    install("gold-rush", "recrl.tasks", f"rush = {target}")
     with pytest.raises(UnknownNameError) as error:
         find_task("rush")
     assert str(error.value) == (

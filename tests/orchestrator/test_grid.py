@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -57,14 +58,8 @@ def _grid(text: str) -> GridSpec:
     return parse_grid(text.encode(), source="grid.yaml")
 
 
-def test_a_name_of_ours_that_a_package_has_too_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    distribution = tmp_path / "theirs-1.0.dist-info"
-    distribution.mkdir()
-    (distribution / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
-    (distribution / "entry_points.txt").write_text("[recrl.teachers]\nlinear = theirs:LINEAR\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
+def test_a_name_of_ours_that_a_package_has_too_is_refused(install: Callable[[str, str, str], None]) -> None:
+    install("theirs", "recrl.teachers", "linear = theirs:LINEAR")
     assert _problems(SMALL) == [
         "grid.yaml:4: methods.1: the curriculum 'linear' is recrl's, and also an entry point, "
         "'theirs:LINEAR' of the package theirs; rename that entry point, or uninstall its package to use "
